@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+# make preview [SCENE=file]   sets everything up, draws the scene, prints what building its tree cost per thread count
+# make test                   sets everything up, runs the C++ and the Python tests
+# make package                build/espalier-VERSION.zip, the extension as users install it
+# make sanitize               the C++ tests under the address, undefined-behaviour and thread sanitizers
+# make lint | make format     checks or applies the style of Python and C++
+# make blenders               the other Blenders the installation tests run in (root, 4 GB, kept in the user's cache)
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DELETE_ON_ERROR:
+.PHONY: preview test test-native package sanitize lint format blenders native system python clean
+
+SCENE ?= build/scenes/interior.blend
+CACHE := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/espalier
+JOBS := $(shell nproc)
+# What Blender's module loads, and what the native module is compiled with.
+SYSTEM := libgl1 libgomp1 libsm6 libxfixes3 libxi6 libxkbcommon0 libxrender1 libxxf86vm1 libhwy-dev \
+	$(if $(shell command -v c++),,g++)
+NATIVE := CMakeLists.txt CMakePresets.json pyproject.toml $(shell find native -type f)
+ADDON := blender_manifest.toml $(wildcard addon/*.py)
+export PATH := $(CURDIR)/.venv/bin:$(PATH)
+
+preview: native $(if $(filter build/scenes/%,$(SCENE)),$(SCENE))
+	mkdir -p build/preview
+	python -m addon.cli preview "$(SCENE)" --output build/preview/preview.png --json build/preview/timings.json
+
+build/scenes/%.blend: scenes/%.py scenes/kit.py | python
+	mkdir -p build/scenes
+	python $< $@
+
+test: test-native native package
+	tools/environment .venv "3.11 3.13" -r requirements/test.txt
+	python -m pytest
+
+test-native: python
+	tools/need libgtest-dev
+	cmake --preset release -DESPALIER_TESTS=ON
+	cmake --build --preset release -j $(JOBS)
+	ctest --preset release -j $(JOBS) --output-on-failure
+
+package: build/package.stamp
+build/package.stamp: $(NATIVE) $(ADDON) tools/package.py | native
+	python tools/package.py
+	touch $@
+
+sanitize: sanitize-asan sanitize-tsan
+sanitize-%: python
+	tools/need libgtest-dev
+	cmake --preset $*
+	cmake --build --preset $* -j $(JOBS)
+	ctest --preset $* --output-on-failure
+
+lint: native
+	tools/environment .venv "3.11 3.13" -r requirements/lint.txt
+	ruff check .
+	ruff format --check .
+	mypy addon scenes tests tools
+	git ls-files '*.h' '*.cpp' | xargs clang-format --dry-run -Werror
+	git ls-files 'native/*.cpp' | xargs -P $(JOBS) -n 1 clang-tidy --quiet -p build/release
+
+format: python
+	tools/environment .venv "3.11 3.13" -r requirements/lint.txt
+	ruff check --fix .
+	ruff format .
+	git ls-files '*.h' '*.cpp' | xargs clang-format -i
+
+blenders:
+	tools/environment $(CACHE)/bpy-4.2.23 3.11 bpy==4.2.23
+	tools/environment $(CACHE)/bpy-5.0.1 3.11 bpy==5.0.1
+	tools/environment $(CACHE)/bpy-5.2.3 3.13 bpy==5.2.3
+	tools/real-blender
+
+# The native module is installed from the wheel that users get, and only when a source is newer.
+native: .venv/native.stamp
+.venv/native.stamp: $(NATIVE) | python
+	python tools/package.py wheel
+	touch $@
+
+python: system
+	tools/environment .venv "3.11 3.13" -r requirements/run.txt
+
+system:
+	tools/need $(SYSTEM)
+
+clean:
+	rm -rf build .venv
