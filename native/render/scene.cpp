@@ -20,219 +20,259 @@ constexpr uint64_t kMaxVertices = std::numeric_limits<uint32_t>::max();
 
 /// A run of consecutive vertices or triangles of one placement: the unit of parallel work.
 struct Chunk {
-  size_t placement, begin, end;
+    size_t placement, begin, end;
 };
 
 template <class Count>
 std::vector<Chunk> make_chunks(size_t placements, const Count& count) {
-  std::vector<Chunk> chunks;
-  for (size_t placement = 0; placement < placements; ++placement) {
-    const size_t total = count(placement);
-    for (size_t begin = 0; begin < total; begin += kChunk) chunks.push_back({placement, begin, std::min(begin + kChunk, total)});
-  }
-  return chunks;
+    std::vector<Chunk> chunks;
+    for (size_t placement = 0; placement < placements; ++placement) {
+        const size_t total = count(placement);
+        for (size_t begin = 0; begin < total; begin += kChunk)
+            chunks.push_back({placement, begin, std::min(begin + kChunk, total)});
+    }
+    return chunks;
 }
 
-Vec3d load(std::span<const float> xyz, size_t index) { return {xyz[3 * index], xyz[3 * index + 1], xyz[3 * index + 2]}; }
-
-bool is_finite(Vec3d p) { return std::isfinite(p.x) && std::isfinite(p.y) && std::isfinite(p.z); }
+Vec3d load(std::span<const float> xyz, size_t index) {
+    return {xyz[3 * index], xyz[3 * index + 1], xyz[3 * index + 2]};
+}
 
 struct Bounds {
-  Vec3d lower{HUGE_VAL, HUGE_VAL, HUGE_VAL};
-  Vec3d upper{-HUGE_VAL, -HUGE_VAL, -HUGE_VAL};
+    Vec3d lower{HUGE_VAL, HUGE_VAL, HUGE_VAL};
+    Vec3d upper{-HUGE_VAL, -HUGE_VAL, -HUGE_VAL};
 
-  void add(const Bounds& other) {
-    lower = {std::min(lower.x, other.lower.x), std::min(lower.y, other.lower.y), std::min(lower.z, other.lower.z)};
-    upper = {std::max(upper.x, other.upper.x), std::max(upper.y, other.upper.y), std::max(upper.z, other.upper.z)};
-  }
+    void add(const Bounds& other) {
+        lower = {std::min(lower.x, other.lower.x), std::min(lower.y, other.lower.y), std::min(lower.z, other.lower.z)};
+        upper = {std::max(upper.x, other.upper.x), std::max(upper.y, other.upper.y), std::max(upper.z, other.upper.z)};
+    }
 };
 
 void check_mesh(const MeshInput& mesh) {
-  const size_t vertices = mesh.positions.size() / 3;
-  const size_t triangles = mesh.triangles.size() / 3;
-  for (size_t i = 0; i < mesh.triangles.size(); ++i) {
-    if (mesh.triangles[i] >= vertices) {
-      throw std::out_of_range("mesh '" + mesh.name + "': triangle " + std::to_string(i / 3) + " has vertex index " +
-                              std::to_string(static_cast<int32_t>(mesh.triangles[i])) + ", outside the mesh's " + std::to_string(vertices) +
-                              " vertices");
+    const size_t vertices = mesh.positions.size() / 3;
+    const size_t triangles = mesh.triangles.size() / 3;
+    for (size_t i = 0; i < mesh.triangles.size(); ++i) {
+        if (mesh.triangles[i] >= vertices) {
+            throw std::out_of_range("mesh '" + mesh.name + "': triangle " + std::to_string(i / 3) +
+                                    " has vertex index " + std::to_string(static_cast<int32_t>(mesh.triangles[i])) +
+                                    ", outside the mesh's " + std::to_string(vertices) + " vertices");
+        }
     }
-  }
-  for (size_t i = 0; i < mesh.material_slots.size(); ++i) {
-    if (mesh.material_slots[i] < 0) {
-      throw std::out_of_range("mesh '" + mesh.name + "': material_slots of triangle " + std::to_string(i) + " is negative");
+    for (size_t i = 0; i < mesh.material_slots.size(); ++i) {
+        if (mesh.material_slots[i] < 0) {
+            throw std::out_of_range("mesh '" + mesh.name + "': material_slots of triangle " + std::to_string(i) +
+                                    " is negative");
+        }
     }
-  }
-  const size_t normals = mesh.normals.size() / 3;
-  const size_t expected = mesh.normal_kind == NormalKind::kFlat ? 0 : mesh.normal_kind == NormalKind::kPerVertex ? vertices : 3 * triangles;
-  if (normals != expected) throw std::invalid_argument("mesh '" + mesh.name + "': normals has the wrong length");
-  if (!mesh.material_slots.empty() && mesh.material_slots.size() != triangles) {
-    throw std::invalid_argument("mesh '" + mesh.name + "': material_slots must have one entry per triangle");
-  }
+    const size_t normals = mesh.normals.size() / 3;
+    const size_t expected = mesh.normal_kind == NormalKind::kFlat        ? 0
+                            : mesh.normal_kind == NormalKind::kPerVertex ? vertices
+                                                                         : 3 * triangles;
+    if (normals != expected)
+        throw std::invalid_argument("mesh '" + mesh.name + "': normals has the wrong length");
+    if (!mesh.material_slots.empty() && mesh.material_slots.size() != triangles) {
+        throw std::invalid_argument("mesh '" + mesh.name + "': material_slots must have one entry per triangle");
+    }
 }
 
 void check_placement(const Placement& placement, size_t meshes, size_t materials) {
-  const std::string where = "object '" + placement.object + "': ";
-  if (placement.mesh >= meshes) {
-    throw std::out_of_range(where + "mesh index " + std::to_string(placement.mesh) + " is outside the scene's " + std::to_string(meshes) +
-                            " meshes");
-  }
-  if (!placement.matrix.finite()) throw std::invalid_argument(where + "matrix is not finite");
-  if (placement.materials.empty()) throw std::invalid_argument(where + "materials must have at least one entry");
-  for (const int32_t material : placement.materials) {
-    if (material < 0 || static_cast<size_t>(material) >= materials) {
-      throw std::out_of_range(where + "material index " + std::to_string(material) + " is outside the scene's " + std::to_string(materials) +
-                              " materials");
+    const std::string where = "object '" + placement.object + "': ";
+    if (placement.mesh >= meshes) {
+        throw std::out_of_range(where + "mesh index " + std::to_string(placement.mesh) + " is outside the scene's " +
+                                std::to_string(meshes) + " meshes");
     }
-  }
+    if (!placement.matrix.finite())
+        throw std::invalid_argument(where + "matrix is not finite");
+    if (placement.materials.empty())
+        throw std::invalid_argument(where + "materials must have at least one entry");
+    for (const int32_t material : placement.materials) {
+        if (material < 0 || static_cast<size_t>(material) >= materials) {
+            throw std::out_of_range(where + "material index " + std::to_string(material) + " is outside the scene's " +
+                                    std::to_string(materials) + " materials");
+        }
+    }
 }
 
 }  // namespace
 
-Scene::Scene(std::span<const MeshInput> meshes, std::span<const Placement> placements, std::span<const float> materials, int threads) {
-  const auto start = std::chrono::steady_clock::now();
-  if (threads <= 0) threads = hardware_threads();
-  parallel_for(threads, meshes.size(), [&](size_t i) { check_mesh(meshes[i]); });
-  for (const Placement& placement : placements) check_placement(placement, meshes.size(), materials.size() / 3);
+Scene::Scene(std::span<const MeshInput> meshes, std::span<const Placement> placements, std::span<const float> materials,
+             int threads) {
+    const auto start = std::chrono::steady_clock::now();
+    if (threads <= 0)
+        threads = hardware_threads();
+    parallel_for(threads, meshes.size(), [&](size_t i) { check_mesh(meshes[i]); });
+    for (const Placement& placement : placements)
+        check_placement(placement, meshes.size(), materials.size() / 3);
 
-  for (size_t i = 0; i < materials.size() / 3; ++i) materials_.push_back({materials[3 * i], materials[3 * i + 1], materials[3 * i + 2]});
-  for (const MeshInput& mesh : meshes) {
-    meshes_.push_back({mesh.normal_kind,
-                       {mesh.normals.begin(), mesh.normals.end()},
-                       {mesh.material_slots.begin(), mesh.material_slots.end()}});
-  }
-  place(meshes, placements, threads);
-  count_rejected(placements, threads);
-  placing_ms_ = std::chrono::duration<double, std::milli>(std::chrono::steady_clock::now() - start).count();
+    for (size_t i = 0; i < materials.size() / 3; ++i)
+        materials_.push_back({materials[3 * i], materials[3 * i + 1], materials[3 * i + 2]});
+    for (const MeshInput& mesh : meshes) {
+        meshes_.push_back({mesh.normal_kind,
+                           {mesh.normals.begin(), mesh.normals.end()},
+                           {mesh.material_slots.begin(), mesh.material_slots.end()}});
+    }
+    place(meshes, placements, threads);
+    count_rejected(placements, threads);
+    placing_ms_ = std::chrono::duration<double, std::milli>(std::chrono::steady_clock::now() - start).count();
 }
 
 void Scene::place(std::span<const MeshInput> meshes, std::span<const Placement> placements, int threads) {
-  uint64_t vertices = 0, triangles = 0;
-  for (const Placement& placement : placements) {
-    const MeshInput& mesh = meshes[placement.mesh];
-    placed_.push_back(
-        {placement.mesh, static_cast<uint32_t>(vertices), normal_columns(placement.matrix), placement.materials});
+    uint64_t vertices = 0, triangles = 0;
+    for (const Placement& placement : placements) {
+        const MeshInput& mesh = meshes[placement.mesh];
+        placed_.push_back(
+            {placement.mesh, static_cast<uint32_t>(vertices), normal_columns(placement.matrix), placement.materials});
+        first_triangle_.push_back(static_cast<uint32_t>(triangles));
+        vertices += mesh.positions.size() / 3;
+        triangles += mesh.triangles.size() / 3;
+        if (triangles > kMaxTriangles || vertices > kMaxVertices) {
+            throw std::invalid_argument("the placed scene has more than " + std::to_string(kMaxTriangles) +
+                                        " triangles or 2^32 vertices, more than a 32-bit index can name");
+        }
+    }
     first_triangle_.push_back(static_cast<uint32_t>(triangles));
-    vertices += mesh.positions.size() / 3;
-    triangles += mesh.triangles.size() / 3;
-    if (triangles > kMaxTriangles || vertices > kMaxVertices) {
-      throw std::invalid_argument("the placed scene has more than " + std::to_string(kMaxTriangles) +
-                                  " triangles or 2^32 vertices, more than a 32-bit index can name");
-    }
-  }
-  first_triangle_.push_back(static_cast<uint32_t>(triangles));
-  positions_.resize(3 * vertices);
-  triangles_.resize(3 * triangles);
+    positions_.resize(3 * vertices);
+    triangles_.resize(3 * triangles);
 
-  const auto vertex_chunks = make_chunks(placements.size(), [&](size_t p) { return meshes[placements[p].mesh].positions.size() / 3; });
-  std::vector<Bounds> chunk_bounds(vertex_chunks.size());
-  parallel_for(threads, vertex_chunks.size(), [&](size_t c) {
-    const Chunk& chunk = vertex_chunks[c];
-    const Placement& placement = placements[chunk.placement];
+    const auto vertex_chunks =
+        make_chunks(placements.size(), [&](size_t p) { return meshes[placements[p].mesh].positions.size() / 3; });
+    std::vector<Bounds> chunk_bounds(vertex_chunks.size());
+    parallel_for(threads, vertex_chunks.size(), [&](size_t c) {
+        const Chunk& chunk = vertex_chunks[c];
+        const Placement& placement = placements[chunk.placement];
+        Bounds bounds;
+        for (size_t i = chunk.begin; i < chunk.end; ++i) {
+            const Vec3d p = placement.matrix.point(load(meshes[placement.mesh].positions, i));
+            if (is_finite(p))
+                bounds.add({p, p});
+        }
+        chunk_bounds[c] = bounds;
+    });
     Bounds bounds;
-    for (size_t i = chunk.begin; i < chunk.end; ++i) {
-      const Vec3d p = placement.matrix.point(load(meshes[placement.mesh].positions, i));
-      if (is_finite(p)) bounds.add({p, p});
-    }
-    chunk_bounds[c] = bounds;
-  });
-  Bounds bounds;
-  for (const Bounds& part : chunk_bounds) bounds.add(part);
-  if (bounds.lower.x <= bounds.upper.x) centre_ = bounds.lower * 0.5 + bounds.upper * 0.5;
+    for (const Bounds& part : chunk_bounds)
+        bounds.add(part);
+    if (bounds.lower.x <= bounds.upper.x)
+        centre_ = bounds.lower * 0.5 + bounds.upper * 0.5;
 
-  parallel_for(threads, vertex_chunks.size(), [&](size_t c) {
-    const Chunk& chunk = vertex_chunks[c];
-    const Placement& placement = placements[chunk.placement];
-    for (size_t i = chunk.begin; i < chunk.end; ++i) {
-      const Vec3f p = to_float(placement.matrix.point(load(meshes[placement.mesh].positions, i)) - centre_);
-      float* out = &positions_[3 * (placed_[chunk.placement].first_vertex + i)];
-      out[0] = p.x, out[1] = p.y, out[2] = p.z;
-    }
-  });
-  const auto index_chunks = make_chunks(placements.size(), [&](size_t p) { return meshes[placements[p].mesh].triangles.size(); });
-  parallel_for(threads, index_chunks.size(), [&](size_t c) {
-    const Chunk& chunk = index_chunks[c];
-    const MeshInput& mesh = meshes[placements[chunk.placement].mesh];
-    const size_t out = 3 * size_t{first_triangle_[chunk.placement]};
-    for (size_t i = chunk.begin; i < chunk.end; ++i) triangles_[out + i] = mesh.triangles[i] + placed_[chunk.placement].first_vertex;
-  });
+    parallel_for(threads, vertex_chunks.size(), [&](size_t c) {
+        const Chunk& chunk = vertex_chunks[c];
+        const Placement& placement = placements[chunk.placement];
+        for (size_t i = chunk.begin; i < chunk.end; ++i) {
+            const Vec3f p = to_float(placement.matrix.point(load(meshes[placement.mesh].positions, i)) - centre_);
+            float* out = &positions_[3 * (placed_[chunk.placement].first_vertex + i)];
+            out[0] = p.x, out[1] = p.y, out[2] = p.z;
+        }
+    });
+    const auto index_chunks =
+        make_chunks(placements.size(), [&](size_t p) { return meshes[placements[p].mesh].triangles.size(); });
+    parallel_for(threads, index_chunks.size(), [&](size_t c) {
+        const Chunk& chunk = index_chunks[c];
+        const MeshInput& mesh = meshes[placements[chunk.placement].mesh];
+        const size_t out = 3 * size_t{first_triangle_[chunk.placement]};
+        for (size_t i = chunk.begin; i < chunk.end; ++i)
+            triangles_[out + i] = mesh.triangles[i] + placed_[chunk.placement].first_vertex;
+    });
 }
 
 void Scene::count_rejected(std::span<const Placement> placements, int threads) {
-  const auto chunks = make_chunks(placements.size(), [&](size_t p) { return size_t{first_triangle_[p + 1]} - first_triangle_[p]; });
-  std::vector<ObjectSummary> counts(chunks.size());
-  parallel_for(threads, chunks.size(), [&](size_t c) {
-    ObjectSummary& count = counts[c];
-    for (size_t i = chunks[c].begin; i < chunks[c].end; ++i) {
-      const uint32_t* corners = &triangles_[3 * (first_triangle_[chunks[c].placement] + i)];
-      const auto corner = [&](int k) { return to_float(vertex(corners[k])); };
-      switch (classify_face(corner(0), corner(1), corner(2))) {
-        case FaceFault::kNone: break;
-        case FaceFault::kNotFinite: ++count.not_finite; break;
-        case FaceFault::kNoArea: ++count.no_area; break;
-        case FaceFault::kTooLarge: ++count.too_large; break;
-      }
-    }
-  });
+    const auto chunks =
+        make_chunks(placements.size(), [&](size_t p) { return size_t{first_triangle_[p + 1]} - first_triangle_[p]; });
+    std::vector<ObjectSummary> counts(chunks.size());
+    parallel_for(threads, chunks.size(), [&](size_t c) {
+        ObjectSummary& count = counts[c];
+        for (size_t i = chunks[c].begin; i < chunks[c].end; ++i) {
+            const uint32_t* corners = &triangles_[3 * (first_triangle_[chunks[c].placement] + i)];
+            const auto corner = [&](int k) { return to_float(vertex(corners[k])); };
+            switch (classify_face(corner(0), corner(1), corner(2))) {
+                case FaceFault::kNone:
+                    break;
+                case FaceFault::kNotFinite:
+                    ++count.not_finite;
+                    break;
+                case FaceFault::kNoArea:
+                    ++count.no_area;
+                    break;
+                case FaceFault::kTooLarge:
+                    ++count.too_large;
+                    break;
+            }
+        }
+    });
 
-  std::unordered_map<std::string, size_t> by_name;
-  std::vector<size_t> object_of(placements.size());
-  for (size_t p = 0; p < placements.size(); ++p) {
-    const auto [entry, added] = by_name.try_emplace(placements[p].object, objects_.size());
-    if (added) objects_.push_back({placements[p].object});
-    object_of[p] = entry->second;
-    objects_[entry->second].triangles += first_triangle_[p + 1] - first_triangle_[p];
-  }
-  for (size_t c = 0; c < chunks.size(); ++c) {
-    ObjectSummary& object = objects_[object_of[chunks[c].placement]];
-    object.not_finite += counts[c].not_finite;
-    object.no_area += counts[c].no_area;
-    object.too_large += counts[c].too_large;
-  }
+    std::unordered_map<std::string, size_t> by_name;
+    std::vector<size_t> object_of(placements.size());
+    for (size_t p = 0; p < placements.size(); ++p) {
+        const auto [entry, added] = by_name.try_emplace(placements[p].object, objects_.size());
+        if (added)
+            objects_.push_back({placements[p].object});
+        object_of[p] = entry->second;
+        objects_[entry->second].triangles += first_triangle_[p + 1] - first_triangle_[p];
+    }
+    for (size_t c = 0; c < chunks.size(); ++c) {
+        ObjectSummary& object = objects_[object_of[chunks[c].placement]];
+        object.not_finite += counts[c].not_finite;
+        object.no_area += counts[c].no_area;
+        object.too_large += counts[c].too_large;
+    }
 }
 
 size_t Scene::placement_of(uint32_t triangle) const {
-  // Placements without triangles share their start with the next one; the last that starts at or before the triangle owns it.
-  return static_cast<size_t>(std::upper_bound(first_triangle_.begin(), first_triangle_.end(), triangle) - first_triangle_.begin()) - 1;
+    // Placements without triangles share their start with the next one; the last that starts at or before the triangle
+    // owns it.
+    return static_cast<size_t>(std::upper_bound(first_triangle_.begin(), first_triangle_.end(), triangle) -
+                               first_triangle_.begin()) -
+           1;
 }
 
 Vec3d Scene::vertex(uint32_t index) const { return load(positions_, index); }
 
-SurfacePoint Scene::surface(uint32_t triangle, double u, double v) const {
-  const size_t placement = placement_of(triangle);
-  const Placed& placed = placed_[placement];
-  const MeshShading& mesh = meshes_[placed.mesh];
-  const uint32_t local = triangle - first_triangle_[placement];
-  const uint32_t* corners = &triangles_[3 * size_t{triangle}];
-  const std::array<Vec3d, 3> p{vertex(corners[0]), vertex(corners[1]), vertex(corners[2])};
-  const std::array<double, 3> weight{1.0 - u - v, u, v};
+SurfacePoint Scene::surface(uint32_t triangle, double u, double v, Vec3d direction) const {
+    const size_t placement = placement_of(triangle);
+    const Placed& placed = placed_[placement];
+    const MeshShading& mesh = meshes_[placed.mesh];
+    const size_t local = triangle - first_triangle_[placement];
+    const uint32_t* corners = &triangles_[3 * size_t{triangle}];
+    const std::array<Vec3d, 3> p{vertex(corners[0]), vertex(corners[1]), vertex(corners[2])};
 
-  SurfacePoint point;
-  point.position = p[0] + (p[1] - p[0]) * u + (p[2] - p[0]) * v;
-  point.geometric_normal = normalize_or(cross(p[1] - p[0], p[2] - p[0]), {0.0, 0.0, 1.0});
-  point.shading_normal = point.geometric_normal;
-  point.shadow_lift = {0.0, 0.0, 0.0};
-  // A slot beyond the object's materials takes the last one, as Blender does.
-  const size_t slot = mesh.slots.empty() ? 0 : static_cast<size_t>(mesh.slots[local]);
-  point.base_color = materials_[static_cast<size_t>(placed.materials[std::min(slot, placed.materials.size() - 1)])];
-  if (mesh.kind == NormalKind::kFlat) return point;
+    SurfacePoint point;
+    double extent = 0.0;
+    point.position = p[0] + (p[1] - p[0]) * u + (p[2] - p[0]) * v;
+    for (const Vec3d corner : p)
+        extent = std::max({extent, std::abs(corner.x), std::abs(corner.y), std::abs(corner.z)});
+    point.error = extent * 0x1p-49;
+    const Vec3d wound = normalize_or(cross(p[1] - p[0], p[2] - p[0]), {0.0, 0.0, 1.0});
+    point.geometric_normal = dot(wound, direction) > 0.0 ? -wound : wound;
+    point.shading_normal = point.geometric_normal;
+    // A slot beyond the object's materials takes the last one, as Blender does.
+    const size_t slot = mesh.slots.empty() ? 0 : static_cast<size_t>(mesh.slots[local]);
+    point.base_color = materials_[static_cast<size_t>(placed.materials[std::min(slot, placed.materials.size() - 1)])];
+    if (mesh.kind == NormalKind::kFlat)
+        return point;
 
-  // Shadow rays start on the surface that the normals suggest: the point is moved onto the tangent plane of each corner it lies
-  // below, by that corner's weight (Hanika, Hacking the Shadow Terminator). Otherwise the faces of a coarse mesh shade themselves.
-  std::array<Vec3d, 3> normal;
-  Vec3d sum{0.0, 0.0, 0.0};
-  for (size_t k = 0; k < 3; ++k) {
-    const size_t index = mesh.kind == NormalKind::kPerVertex ? corners[k] - placed.first_vertex : 3 * size_t{local} + k;
-    const Vec3d n = load(mesh.normals, index);
-    const auto& columns = placed.normal_columns;
-    normal[k] = normalize_or(columns[0] * n.x + columns[1] * n.y + columns[2] * n.z, point.geometric_normal);
-    sum = sum + normal[k] * weight[k];
-  }
-  point.shading_normal = normalize_or(sum, point.geometric_normal);
-  point.smooth = true;
-  const double side = dot(point.shading_normal, point.geometric_normal) < 0.0 ? -1.0 : 1.0;
-  (void)side;
-  for (size_t k = 0; k < 3; ++k) point.shadow_lift = point.shadow_lift - normal[k] * (weight[k] * std::min(0.0, dot(point.position - p[k], normal[k])));
-  return point;
+    const std::array<double, 3> weight{1.0 - u - v, u, v};
+    std::array<Vec3d, 3> normal;
+    Vec3d sum{0.0, 0.0, 0.0};
+    for (size_t k = 0; k < 3; ++k) {
+        const size_t index = mesh.kind == NormalKind::kPerVertex ? corners[k] - placed.first_vertex : 3 * local + k;
+        const Vec3d n = load(mesh.normals, index);
+        const auto& columns = placed.normal_columns;
+        normal[k] = normalize_or(columns[0] * n.x + columns[1] * n.y + columns[2] * n.z, wound);
+        sum += normal[k] * weight[k];
+    }
+    point.shading_normal = normalize_or(sum, wound);
+    double side = 1.0;
+    if (dot(point.shading_normal, point.geometric_normal) < 0.0) {
+        point.shading_normal = -point.shading_normal;
+        side = -1.0;
+    }
+    // Shadow rays start on the surface that the normals suggest: the point is moved onto the tangent plane of each
+    // corner it lies below, by that corner's weight (Hanika, Hacking the Shadow Terminator). Otherwise the faces of a
+    // coarse mesh shade themselves.
+    for (size_t k = 0; k < 3; ++k) {
+        const Vec3d n = normal[k] * side;
+        point.shadow_lift = point.shadow_lift - n * (weight[k] * std::min(0.0, dot(point.position - p[k], n)));
+    }
+    return point;
 }
 
 }  // namespace espalier

@@ -1,0 +1,32 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+#include "render/shading.h"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+namespace espalier {
+namespace {
+
+double largest(Vec3d v) { return std::max({std::abs(v.x), std::abs(v.y), std::abs(v.z)}); }
+
+}  // namespace
+
+Ray shadow_ray(const SurfacePoint& surface, const LightSample& sample) {
+    const Vec3d normal = surface.geometric_normal;
+    const Vec3d lifted = surface.position + surface.shadow_lift;
+    // Rounding moves each coordinate by at most 2^-24 of it; twice what that can take away along the normal is added
+    // beforehand.
+    const double rounding =
+        std::abs(normal.x * lifted.x) + std::abs(normal.y * lifted.y) + std::abs(normal.z * lifted.z);
+    const Vec3f start = to_float(lifted + normal * (surface.error + rounding * 0x1p-23));
+    if (sample.distant)
+        return {start, 0.0F, to_float(sample.to_light), std::numeric_limits<float>::infinity()};
+
+    // The end is drawn back by its own rounding error, so that a lamp lying in a surface is not hidden by that surface.
+    const Vec3d end = surface.position + sample.to_light;
+    const double end_error = (largest(end) + largest(lifted)) * 0x1p-22 / length(sample.to_light);
+    return {start, 0.0F, to_float(end - to_double(start)), static_cast<float>(std::max(0.0, 1.0 - end_error))};
+}
+
+}  // namespace espalier
