@@ -5,7 +5,6 @@
 #include <cmath>
 #include <numbers>
 #include <stdexcept>
-#include <string>
 
 namespace espalier {
 namespace {
@@ -14,7 +13,7 @@ constexpr double kPi = std::numbers::pi;
 
 void require(bool holds, const char* what) {
     if (!holds)
-        throw std::invalid_argument(std::string("light: ") + what);
+        throw std::invalid_argument(what);
 }
 
 /// `axis` measured in units of its own length, so that a dot product with it undoes the scale.

@@ -1,0 +1,119 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+#include <pybind11/stl.h>
+
+#include <memory>
+#include <vector>
+
+#include "module/arrays.h"
+#include "module/bindings.h"
+#include "module/fields.h"
+#include "module/reports.h"
+#include "render/scene.h"
+
+namespace py = pybind11;
+using namespace py::literals;
+
+namespace espalier {
+namespace {
+
+/// A mesh's arrays, held while the scene is made from them.
+struct HeldMesh {
+    Array<float> positions, normals;
+    Array<uint32_t> triangles;
+    Array<int32_t> slots;
+    MeshInput input;
+};
+
+HeldMesh mesh_from(const Fields& fields) {
+    HeldMesh mesh;
+    mesh.input.name = fields.required<std::string>("name");
+    const std::string where = "mesh '" + mesh.input.name + "': ";
+    mesh.positions = float_array(fields.at("positions"), where + "positions", {kAny, 3});
+    mesh.triangles = triangle_array(fields.at("triangles"), where + "triangles", mesh.positions.rows());
+    mesh.input.positions = mesh.positions.span();
+    mesh.input.triangles = mesh.triangles.span();
+    const auto vertices = static_cast<py::ssize_t>(mesh.positions.rows());
+    const auto triangles = static_cast<py::ssize_t>(mesh.triangles.rows());
+    if (const py::object normals = fields.find("normals"); !normals.is_none()) {
+        const bool per_corner =
+            py::isinstance<py::array>(normals) && py::reinterpret_borrow<py::array>(normals).ndim() == 3;
+        mesh.normals = per_corner ? float_array(normals, where + "normals", {triangles, 3, 3})
+                                  : float_array(normals, where + "normals", {vertices, 3});
+        mesh.input.normals = mesh.normals.span();
+        mesh.input.normal_kind = per_corner ? NormalKind::kPerCorner : NormalKind::kPerVertex;
+    }
+    if (const py::object slots = fields.find("material_slots"); !slots.is_none()) {
+        mesh.slots = int_array(slots, where + "material_slots", {triangles});
+        mesh.input.material_slots = mesh.slots.span();
+    }
+    return mesh;
+}
+
+Placement placement_from(const Fields& fields) {
+    Placement placement;
+    placement.object = fields.required<std::string>("object");
+    const std::string where = "object '" + placement.object + "': ";
+    const auto mesh = fields.required<int64_t>("mesh");
+    if (mesh < 0 || mesh > std::numeric_limits<uint32_t>::max()) {
+        throw py::index_error(where + "mesh index " + std::to_string(mesh) + " is out of range");
+    }
+    placement.mesh = static_cast<uint32_t>(mesh);
+    placement.matrix = matrix_from(fields.at("matrix"), where + "matrix");
+    const Array<int32_t> materials = int_array(fields.at("materials"), where + "materials", {kAny});
+    placement.materials.assign(materials.span().begin(), materials.span().end());
+    return placement;
+}
+
+std::shared_ptr<Scene> make_scene(const py::list& meshes, const py::list& placements, py::handle materials) {
+    std::vector<HeldMesh> held;
+    for (size_t i = 0; i < meshes.size(); ++i)
+        held.push_back(mesh_from(Fields(meshes[i], "meshes", i)));
+    std::vector<Placement> placed;
+    for (size_t i = 0; i < placements.size(); ++i)
+        placed.push_back(placement_from(Fields(placements[i], "placements", i)));
+    const Array<float> colors = float_array(materials, "materials", {kAny, 3});
+    for (const float value : colors.span()) {
+        if (!std::isfinite(value))
+            throw py::value_error("materials must be finite");
+    }
+    std::vector<MeshInput> inputs;
+    for (const HeldMesh& mesh : held)
+        inputs.push_back(mesh.input);
+    const py::gil_scoped_release release;
+    return std::make_shared<Scene>(inputs, placed, colors.span());
+}
+
+}  // namespace
+
+void bind_scene(py::module_& module) {
+    py::class_<Scene, std::shared_ptr<Scene>>(
+        module, "Scene",
+        "Placed meshes, flattened to world triangles: formed in double relative to the scene's centre, rounded "
+        "once.\n\n"
+        "Immutable; it copies what it needs, so the arrays may change or go afterwards.")
+        .def(py::init(&make_scene), "meshes"_a, "placements"_a, "materials"_a,
+             "meshes: dicts with name: str, positions: float32 [N, 3], triangles: int32 or uint32 [M, 3],\n"
+             "normals: None (flat), float32 [N, 3] (per vertex) or float32 [M, 3, 3] (per corner), in object space,\n"
+             "material_slots: None or int32 [M], the slot of each triangle.\n"
+             "placements: dicts with object: str, mesh: index into meshes, matrix: float64 [4, 4], object to world\n"
+             "(negative scale allowed), materials: int32 [S], at least one: the material of each slot; a slot beyond "
+             "takes\n"
+             "the last. materials: float32 [K, 3], linear base colours.\n"
+             "Raises TypeError, ValueError or IndexError naming the mesh or the object.")
+        .def_property_readonly("triangle_count", &Scene::triangle_count, "World triangles, rejected faces included.")
+        .def_property_readonly(
+            "centre",
+            [](const Scene& scene) {
+                const Vec3d centre = scene.centre();
+                py::array_t<double> array(3);
+                for (int axis = 0; axis < 3; ++axis)
+                    array.mutable_at(axis) = centre[axis];
+                return array;
+            },
+            "The middle of the world bounds, float64 [3]: the point that world triangles are relative to.")
+        .def_property_readonly(
+            "objects", &objects_list,
+            "One dict per object name: object, triangles, rejected_faces {not_finite, no_area, too_large}.");
+}
+
+}  // namespace espalier

@@ -1,0 +1,211 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+#include <algorithm>
+#include <atomic>
+#include <cmath>
+#include <limits>
+#include <memory>
+
+#include "kdtree/parallel.h"
+#include "kdtree/traversal.h"
+#include "module/arrays.h"
+#include "module/bindings.h"
+#include "module/reports.h"
+
+namespace py = pybind11;
+using namespace py::literals;
+
+namespace espalier {
+namespace {
+
+constexpr size_t kRaysPerTask = 4096;
+
+/// One end of the rays' range: the same for all, or one number per ray.
+struct RangeEnd {
+    float shared = 0.0F;
+    Array<float> each;
+
+    float operator[](size_t ray) const { return each.owner.size() > 0 ? each.owner.data()[ray] : shared; }
+};
+
+RangeEnd range_end(py::handle value, const std::string& name, size_t rays) {
+    if (py::isinstance<py::array>(value) && py::reinterpret_borrow<py::array>(value).ndim() > 0) {
+        return {0.0F, float_array(value, name, {static_cast<py::ssize_t>(rays)})};
+    }
+    const double number = PyFloat_AsDouble(value.ptr());
+    if (number == -1.0 && PyErr_Occurred() != nullptr) {
+        PyErr_Clear();
+        throw py::type_error(name + " must be a number or a float32 array with one number per ray");
+    }
+    return {static_cast<float>(number), {}};
+}
+
+/// Rays as they came from Python, checked while they are packed.
+class RayInput {
+ public:
+    RayInput(py::handle origins, py::handle directions, py::handle t_min, py::handle t_max)
+        : origins_(float_array(origins, "origins", {kAny, 3})),
+          directions_(float_array(directions, "directions", {kAny, 3})),
+          t_min_(range_end(t_min, "t_min", origins_.rows())),
+          t_max_(range_end(t_max, "t_max", origins_.rows())) {
+        if (directions_.rows() != origins_.rows()) {
+            throw py::value_error("directions must have as many rows as origins (" + std::to_string(origins_.rows()) +
+                                  "), not " + std::to_string(directions_.rows()));
+        }
+    }
+
+    size_t size() const { return origins_.rows(); }
+
+    /// Calls trace(first, rays) for runs of rays on `threads` threads; throws for the first ray that is not sound.
+    template <class Trace>
+    void for_each_run(int threads, const Trace& trace) {
+        const py::gil_scoped_release release;
+        std::atomic<size_t> first_bad{size()};
+        parallel_for(
+            threads > 0 ? threads : hardware_threads(), (size() + kRaysPerTask - 1) / kRaysPerTask, [&](size_t task) {
+                const size_t begin = task * kRaysPerTask, end = std::min(begin + kRaysPerTask, size());
+                std::vector<Ray> rays(end - begin);
+                for (size_t i = begin; i < end; ++i) {
+                    rays[i - begin] = ray(i);
+                    if (fault(rays[i - begin]) == nullptr)
+                        continue;
+                    size_t known = first_bad.load(std::memory_order_relaxed);
+                    while (i < known && !first_bad.compare_exchange_weak(known, i, std::memory_order_relaxed)) {
+                    }
+                    return;
+                }
+                trace(begin, std::span<const Ray>(rays));
+            });
+        const size_t bad = first_bad.load();
+        if (bad < size())
+            throw py::value_error("ray " + std::to_string(bad) + ": " + fault(ray(bad)));
+    }
+
+ private:
+    Ray ray(size_t i) const {
+        const float* o = origins_.owner.data() + 3 * i;
+        const float* d = directions_.owner.data() + 3 * i;
+        return {{o[0], o[1], o[2]}, t_min_[i], {d[0], d[1], d[2]}, t_max_[i]};
+    }
+
+    static const char* fault(const Ray& ray) {
+        if (!is_finite(ray.origin))
+            return "origins is not finite";
+        if (!is_finite(ray.direction))
+            return "directions is not finite";
+        if (ray.direction == Vec3f{})
+            return "directions is zero";
+        if (!(ray.t_min >= 0.0F) || std::isinf(ray.t_min))
+            return "t_min must be finite and not negative";
+        if (!(ray.t_max >= ray.t_min))
+            return "t_max must not be less than t_min";
+        return nullptr;
+    }
+
+    Array<float> origins_, directions_;
+    RangeEnd t_min_, t_max_;
+};
+
+std::unique_ptr<Tree> build_tree(py::handle vertices, py::handle triangles, const std::string& quality, int threads) {
+    const Array<float> positions = float_array(vertices, "vertices", {kAny, 3});
+    const Array<uint32_t> indices = triangle_array(triangles, "triangles", positions.rows());
+    const BuildOptions options{.quality = quality_from(quality), .threads = checked_threads(threads)};
+    const py::gil_scoped_release release;
+    return std::make_unique<Tree>(build({positions.span(), indices.span()}, options));
+}
+
+py::dict intersect_rays(const Tree& tree, py::handle origins, py::handle directions, py::handle t_min, py::handle t_max,
+                        int threads) {
+    RayInput input(origins, directions, t_min, t_max);
+    checked_threads(threads);
+    const auto count = static_cast<py::ssize_t>(input.size());
+    py::array_t<float> t(count), u(count), v(count);
+    py::array_t<int32_t> triangle(count);
+    float *t_out = t.mutable_data(), *u_out = u.mutable_data(), *v_out = v.mutable_data();
+    int32_t* triangle_out = triangle.mutable_data();
+    input.for_each_run(threads, [&](size_t first, std::span<const Ray> rays) {
+        std::vector<Hit> hits(rays.size());
+        intersect(tree, rays, hits);
+        for (size_t i = 0; i < hits.size(); ++i) {
+            const Hit& hit = hits[i];
+            const bool missed = hit.triangle < 0;
+            t_out[first + i] = missed ? std::numeric_limits<float>::infinity() : hit.t;
+            u_out[first + i] = missed ? 0.0F : hit.u;
+            v_out[first + i] = missed ? 0.0F : hit.v;
+            triangle_out[first + i] = hit.triangle;
+        }
+    });
+    return py::dict("t"_a = t, "triangle"_a = triangle, "u"_a = u, "v"_a = v);
+}
+
+py::array_t<bool> occluded_rays(const Tree& tree, py::handle origins, py::handle directions, py::handle t_min,
+                                py::handle t_max, int threads) {
+    RayInput input(origins, directions, t_min, t_max);
+    checked_threads(threads);
+    py::array_t<bool> blocked(static_cast<py::ssize_t>(input.size()));
+    static_assert(sizeof(bool) == sizeof(uint8_t));
+    auto* out = reinterpret_cast<uint8_t*>(blocked.mutable_data());
+    input.for_each_run(threads, [&](size_t first, std::span<const Ray> rays) {
+        occluded(tree, rays, std::span<uint8_t>(out + first, rays.size()));
+    });
+    return blocked;
+}
+
+/// The bytes of a buffer as rows of one element type, copied.
+template <class Element, class T>
+py::array bytes_array(const LargeBuffer<T>& buffer, size_t count, std::vector<py::ssize_t> shape) {
+    static_assert(sizeof(T) % sizeof(Element) == 0);
+    shape.insert(shape.begin(), static_cast<py::ssize_t>(count));
+    py::array_t<Element> array(shape);
+    if (count > 0)
+        std::memcpy(array.mutable_data(), buffer.data(), count * sizeof(T));
+    return array;
+}
+
+py::dict tree_arrays(const Tree& tree) {
+    return py::dict("nodes"_a = bytes_array<uint64_t>(tree.nodes, tree.nodes.size(), {}),
+                    "wide_nodes"_a = bytes_array<uint8_t>(tree.wide_nodes, tree.wide_nodes.size(), {sizeof(WideNode)}),
+                    "blocks"_a = bytes_array<uint8_t>(tree.blocks, tree.blocks.size(), {sizeof(TriangleBlock)}));
+}
+
+}  // namespace
+
+void bind_tree(py::module_& module) {
+    py::class_<Tree>(module, "Tree",
+                     "A kd-tree over triangles, made by build(). It keeps its own copy of them and never changes.")
+        .def_property_readonly(
+            "report", [](const Tree& tree) { return report_dict(tree.report); },
+            "What the build took and what came of it.\n\n"
+            "build_ms and phases_ms {bounds, top_levels, subtrees, compaction, layout}: wall-clock milliseconds.\n"
+            "threads, triangles (as given), nodes, leaves, empty_leaves, references (of leaves to triangles), "
+            "wide_nodes,\n"
+            "bytes. sah_cost: expected cost of a ray that meets the scene's box, in the units of sah_constants.\n"
+            "checksum: 16 hexadecimal digits, the same for any number of threads.\n"
+            "rejected_faces {not_finite, no_area, too_large}: faces that no ray can hit, left out of the tree.")
+        .def("intersect", &intersect_rays, "origins"_a, "directions"_a, "t_min"_a = 0.0,
+             "t_max"_a = std::numeric_limits<double>::infinity(), "threads"_a = 0,
+             "The nearest hit of each ray with t_min <= t <= t_max; of equal distances the lowest triangle.\n\n"
+             "origins, directions: float32 [R, 3]; a direction need not have unit length, t counts in directions.\n"
+             "t_min, t_max: a number, or float32 [R] with one per ray. threads: 0 for all.\n"
+             "Returns t float32 [R] (inf at a miss), triangle int32 [R] (-1 at a miss), u and v float32 [R] (0 at a "
+             "miss):\n"
+             "the point is (1-u-v) v0 + u v1 + v v2. Raises TypeError for another dtype, ValueError for another shape, "
+             "a\n"
+             "ray that is not finite, a zero direction, a negative t_min or t_max < t_min.")
+        .def("occluded", &occluded_rays, "origins"_a, "directions"_a, "t_min"_a = 0.0,
+             "t_max"_a = std::numeric_limits<double>::infinity(), "threads"_a = 0,
+             "Whether each ray hits anything with t_min <= t <= t_max: bool [R]. Arguments and errors as of "
+             "intersect().")
+        .def("arrays", &tree_arrays,
+             "Copies of the tree's own arrays, for comparing trees.\n\n"
+             "nodes: uint64 [K], depth first. wide_nodes: uint8 [W, 256]. blocks of eight triangles: uint8 [B, 320].");
+    module.def("build", &build_tree, "vertices"_a, "triangles"_a, "quality"_a = "balanced", "threads"_a = 0,
+               "Builds a kd-tree over triangles.\n\n"
+               "vertices: float32 [N, 3], any values. triangles: int32 or uint32 [M, 3], indices into vertices.\n"
+               "quality: 'draft', 'balanced' or 'best': how long to look for good splits, never what a ray hits.\n"
+               "threads: 0 for all; the tree is the same, bit for bit, for any number.\n"
+               "Faces that are not finite, have no area or lie beyond 2^60 are counted in the report and left out.\n"
+               "Raises TypeError for another dtype, ValueError for another shape, quality or number of threads,\n"
+               "IndexError for an index out of range.");
+}
+
+}  // namespace espalier
