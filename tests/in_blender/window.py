@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Run inside a Blender with a window: window.py ZIP FOLDER. Uses the extension as an artist does and takes shots.
+
+FOLDER gets before.png, after.png and preview.png, and window.json: where the viewport, the sidebar and the overlay's
+boxes are in them, in pixels from the screen's lower left corner.
+"""
+
+import json
+import subprocess
+import sys
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+
+NAME = "bl_ext.user_default.espalier"
+TICK_S = 0.25
+PATIENCE = 240  # ticks
+
+
+def add_terrain(side: int) -> None:
+    """A hilly grid of 2 side² triangles"""
+    steps = np.linspace(-3.0, 3.0, side + 1)
+    x, y = np.meshgrid(steps, steps)
+    vertices = np.stack([x, y, 0.5 * np.sin(2.0 * x) * np.cos(3.0 * y)], axis=-1).reshape(-1, 3)
+    corner = (np.arange(side)[:, None] * (side + 1) + np.arange(side)).ravel()
+    faces = np.stack([corner, corner + 1, corner + side + 2, corner + side + 1], axis=-1)
+    mesh = bpy.data.meshes.new("Terrain")
+    mesh.from_pydata(vertices.tolist(), [], faces.tolist())
+    bpy.context.collection.objects.link(bpy.data.objects.new("Terrain", mesh))
+
+
+def viewport() -> tuple[Any, Any]:
+    """The window and its 3D viewport"""
+    window = bpy.context.window_manager.windows[0]
+    return window, next(area for area in window.screen.areas if area.type == "VIEW_3D")
+
+
+def region_of(area: Any, kind: str) -> Any:
+    return next(region for region in area.regions if region.type == kind)
+
+
+def rectangle(region: Any) -> dict[str, int]:
+    return {"x": region.x, "y": region.y, "width": region.width, "height": region.height}
+
+
+def shoot(path: Path) -> None:
+    subprocess.run(["import", "-window", "root", str(path)], check=True, timeout=60)
+
+
+def click(x: float, y: float) -> None:
+    """Presses the left mouse button at a place counted from the screen's lower left corner"""
+    height = bpy.context.window_manager.windows[0].height
+    place = [str(round(x)), str(round(height - y))]
+    subprocess.run(["xdotool", "mousemove", *place, "sleep", "0.3", "click", "1"], check=True, timeout=60)
+
+
+def steps(zip_file: str, folder: Path) -> Iterator[bool]:
+    """What is done, tick by tick; yields whether to go on"""
+    assert bpy.ops.extensions.package_install_files(
+        filepath=zip_file, repo="user_default", enable_on_install=True, overwrite=True
+    ) == {"FINISHED"}
+    overlay = sys.modules[NAME + ".overlay"]
+    session = sys.modules[NAME + ".session"]
+    operators = sys.modules[NAME + ".operators"]
+    bpy.ops.object.select_all(action="DESELECT")
+    add_terrain(180)
+    scene = bpy.context.scene
+    scene.render.resolution_x, scene.render.resolution_y = 160, 100
+    window, area = viewport()
+    space = area.spaces.active
+    space.show_region_ui = True
+    yield True
+    sidebar = region_of(area, "UI")
+    sidebar.active_panel_category = "Item"
+    yield True
+    yield True
+    shoot(folder / "before.png")
+
+    sidebar.active_panel_category = "Espalier"
+    yield True
+    yield True
+    # The panel's header, then its first two buttons: Preview and Compare Thread Counts.
+    unit = 20.0 * bpy.context.preferences.system.ui_scale
+    top = sidebar.y + sidebar.height
+    middle = sidebar.x + 0.4 * sidebar.width
+    click(middle, top - 4.0 * unit)
+    yield from until(lambda: session.last_report(scene, session.COMPARE) is not None, "the comparison to end")
+    yield from until(overlay.is_on, "the overlay")
+    area.tag_redraw()
+    yield True
+    yield True
+    shoot(folder / "after.png")
+
+    import blf
+
+    def text_width(text: str, size: float) -> float:
+        blf.size(0, size)
+        return float(blf.dimensions(0, text)[0])
+
+    view = region_of(area, "WINDOW")
+    toolbar = region_of(area, "TOOLS").width if bpy.context.preferences.system.use_region_overlap else 0
+    items = overlay.layout(
+        session.last_report(scene, session.COMPARE),
+        toolbar,
+        view.width,
+        bpy.context.preferences.system.ui_scale,
+        text_width,
+    )
+    boxes = [item for item in items if isinstance(item, overlay.Box)]
+    (folder / "window.json").write_text(
+        json.dumps(
+            {
+                "screen": [window.width, window.height],
+                "view": rectangle(view),
+                "sidebar": rectangle(sidebar),
+                "boxes": [
+                    {"x": view.x + b.x, "y": view.y + b.y, "width": b.width, "height": b.height, "color": list(b.color)}
+                    for b in boxes
+                ],
+                "labels": len(items) - len(boxes),
+            }
+        )
+    )
+
+    click(middle, top - 2.5 * unit)
+    yield from until(lambda: session.last_report(scene, session.PREVIEW) is not None, "the preview to end")
+    yield from until(lambda: operators._Watched.running is None, "the operator to end")
+    image = bpy.data.images["Espalier Preview"]
+    assert tuple(image.size) == (160, 100)
+    shown = [
+        area
+        for window in bpy.context.window_manager.windows
+        for area in window.screen.areas
+        if area.type == "IMAGE_EDITOR" and area.spaces.active.image == image
+    ]
+    assert shown, "no image editor shows the preview"
+    yield True
+    yield True
+    shoot(folder / "preview.png")
+
+
+def until(condition: Any, what: str) -> Iterator[bool]:
+    for _ in range(PATIENCE):
+        if condition():
+            return
+        yield True
+    shoot(Path(sys.argv[-1]) / "failed.png")
+    raise TimeoutError(f"waited in vain for {what}")
+
+
+def main() -> None:
+    work = steps(sys.argv[-2], Path(sys.argv[-1]))
+
+    def tick() -> float | None:
+        try:
+            next(work)
+        except StopIteration:
+            print("espalier: came to the end", flush=True)
+        except BaseException:
+            traceback.print_exc()
+        else:
+            return TICK_S
+        bpy.ops.wm.quit_blender()
+        return None
+
+    bpy.context.preferences.view.show_splash = False
+    bpy.app.timers.register(tick, first_interval=2.0)
+
+
+main()

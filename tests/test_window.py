@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A real Blender in a real window on a virtual screen: the panel is there, its buttons work, the overlay is drawn."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from tests.blenders import REAL, ROOT
+from tests.test_package import ZIP
+
+WINDOW = ROOT / "tests/in_blender/window.py"
+SHOTS = ROOT / "build/screenshots"
+SIZE = (1280, 800)
+
+pytestmark = [
+    pytest.mark.skipif(not ZIP.exists(), reason=f"no {ZIP.name} here: make package"),
+    pytest.mark.skipif(REAL.missing() is not None, reason=REAL.missing() or ""),
+]
+
+
+def test_panel_and_overlay_in_a_window() -> None:
+    width, height = SIZE
+    screen = f"-screen 0 {width}x{height}x24 -nolisten tcp"
+    start = ("blender", "--factory-startup", "-p", "0", "0", str(width), str(height), "--python")
+    SHOTS.mkdir(parents=True, exist_ok=True)
+    with REAL.folder() as folder:
+        inside = folder.inside(folder.path)
+        done = folder.run("xvfb-run", "-a", "-s", screen, *start, folder.add(WINDOW), "--", folder.add(ZIP), inside)
+        for shot in folder.path.glob("*.png"):
+            shutil.copy(shot, SHOTS)
+        assert "espalier: came to the end" in done.stdout, f"{done.stdout[-4000:]}\n{done.stderr[-4000:]}"
+        places = json.loads((folder.path / "window.json").read_text(encoding="utf-8"))
+        shots = {}
+        for name in ("before", "after"):
+            raw = folder.path / f"{name}.rgb"
+            folder.run("convert", folder.inside(folder.path / f"{name}.png"), "-depth", "8", folder.inside(raw))
+            shots[name] = np.fromfile(raw, np.uint8).reshape(height, width, 3)[::-1].astype(float) / 255.0
+
+    def part(shot: str, box: dict[str, float]) -> np.ndarray:
+        x, y = round(box["x"]), round(box["y"])
+        return shots[shot][y : y + round(box["height"]), x : x + round(box["width"])]
+
+    changed = np.abs(part("after", places["sidebar"]) - part("before", places["sidebar"])).max(axis=-1) > 0.1
+    assert np.mean(changed) > 0.02, "the sidebar looks the same with and without the Espalier tab"
+
+    background, *bars = places["boxes"]
+    assert len(bars) >= 2  # serial, and at least one thread count
+    assert places["labels"] == 1 + 2 * len(bars)
+    assert np.mean(part("after", background)) < np.mean(part("before", background)) - 0.05, (
+        "no dark ground for the bars"
+    )
+    for bar in bars:
+        inner = part("after", bar)[2:-2, 1:-1]
+        assert np.abs(np.median(inner, axis=(0, 1)) - bar["color"][:3]).max() < 0.03
+        assert np.abs(np.median(part("before", bar), axis=(0, 1)) - bar["color"][:3]).max() > 0.05
+    # Text beside the bars: light on dark.
+    left = {**background, "width": bars[0]["x"] - background["x"]}
+    assert np.mean(part("after", left).min(axis=-1) > 0.6) > 0.01
