@@ -29,11 +29,11 @@ build/scenes/%.blend: scenes/%.py scenes/kit.py | python
 	python $< $@
 
 test: test-native native package
-	tools/environment .venv "3.11 3.13" -r requirements/test.txt
+	@tools/environment .venv "3.11 3.13" -r requirements/test.txt
 	python -m pytest
 
 test-native: python
-	tools/need libgtest-dev
+	@tools/need libgtest-dev
 	cmake --preset release -DESPALIER_TESTS=ON
 	cmake --build --preset release -j $(JOBS)
 	ctest --preset release -j $(JOBS) --output-on-failure
@@ -45,13 +45,13 @@ build/package.stamp: $(NATIVE) $(ADDON) tools/package.py | native
 
 sanitize: sanitize-asan sanitize-tsan
 sanitize-%: python
-	tools/need libgtest-dev
+	@tools/need libgtest-dev
 	cmake --preset $*
 	cmake --build --preset $* -j $(JOBS)
 	ctest --preset $* --output-on-failure
 
 lint: native
-	tools/environment .venv "3.11 3.13" -r requirements/lint.txt
+	@tools/environment .venv "3.11 3.13" -r requirements/lint.txt
 	ruff check .
 	ruff format --check .
 	mypy addon scenes tests tools
@@ -59,16 +59,16 @@ lint: native
 	git ls-files 'native/*.cpp' | xargs -P $(JOBS) -n 1 clang-tidy --quiet -p build/release
 
 format: python
-	tools/environment .venv "3.11 3.13" -r requirements/lint.txt
+	@tools/environment .venv "3.11 3.13" -r requirements/lint.txt
 	ruff check --fix .
 	ruff format .
 	git ls-files '*.h' '*.cpp' | xargs clang-format -i
 
 blenders:
-	tools/environment $(CACHE)/bpy-4.2.23 3.11 bpy==4.2.23
-	tools/environment $(CACHE)/bpy-5.0.1 3.11 bpy==5.0.1
-	tools/environment $(CACHE)/bpy-5.2.3 3.13 bpy==5.2.3
-	tools/real-blender
+	@tools/environment $(CACHE)/bpy-4.2.23 3.11 bpy==4.2.23
+	@tools/environment $(CACHE)/bpy-5.0.1 3.11 bpy==5.0.1
+	@tools/environment $(CACHE)/bpy-5.2.3 3.13 bpy==5.2.3
+	@tools/real-blender
 
 # The native module is installed from the wheel that users get, and only when a source is newer.
 native: .venv/native.stamp
@@ -77,10 +77,10 @@ native: .venv/native.stamp
 	touch $@
 
 python: system
-	tools/environment .venv "3.11 3.13" -r requirements/run.txt
+	@tools/environment .venv "3.11 3.13" -r requirements/run.txt
 
 system:
-	tools/need $(SYSTEM)
+	@tools/need $(SYSTEM)
 
 clean:
 	rm -rf build .venv

@@ -8,7 +8,6 @@ python tools/package.py         the wheels of all Pythons that Blender uses and 
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -51,7 +50,7 @@ def build_wheel(python: Path, version: str) -> Path:
 
 
 def stage(wheels: list[Path]) -> None:
-    """Lays the extension out as it is in the zip; the manifest names the wheels that are really there"""
+    """Lays the extension out as it is in the zip; its manifest also lists the wheels"""
     shutil.rmtree(STAGE, ignore_errors=True)
     shutil.copytree(ROOT / "addon", STAGE, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "LICENSE", STAGE)
@@ -60,10 +59,8 @@ def stage(wheels: list[Path]) -> None:
         shutil.copy(wheel, STAGE / "wheels")
     names = "".join(f'  "./wheels/{wheel.name}",\n' for wheel in wheels)
     manifest = (ROOT / "blender_manifest.toml").read_text(encoding="utf-8")
-    manifest, found = re.subn(r"^wheels = \[.*?\]", f"wheels = [\n{names}]", manifest, flags=re.MULTILINE | re.DOTALL)
-    if found != 1:
-        raise SystemExit("blender_manifest.toml: expected exactly one list named wheels")
-    (STAGE / "blender_manifest.toml").write_text(manifest, encoding="utf-8")
+    top, tables, rest = manifest.partition("\n[")  # the list belongs above the first table
+    (STAGE / "blender_manifest.toml").write_text(f"{top}wheels = [\n{names}]\n{tables}{rest}", encoding="utf-8")
 
 
 def main() -> None:

@@ -87,7 +87,7 @@ def steps(zip_file: str, folder: Path) -> Iterator[bool]:
     unit = 20.0 * bpy.context.preferences.system.ui_scale
     top = sidebar.y + sidebar.height
     middle = sidebar.x + 0.4 * sidebar.width
-    click(middle, top - 4.0 * unit)
+    click(middle, top - 3.45 * unit)
     yield from until(lambda: session.last_report(scene, session.COMPARE) is not None, "the comparison to end")
     yield from until(overlay.is_on, "the overlay")
     area.tag_redraw()
@@ -126,7 +126,7 @@ def steps(zip_file: str, folder: Path) -> Iterator[bool]:
         )
     )
 
-    click(middle, top - 2.5 * unit)
+    click(middle, top - 2.2 * unit)
     yield from until(lambda: session.last_report(scene, session.PREVIEW) is not None, "the preview to end")
     yield from until(lambda: operators._Watched.running is None, "the operator to end")
     image = bpy.data.images["Espalier Preview"]
