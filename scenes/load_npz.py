@@ -19,7 +19,10 @@ LENS = 50  # millimetres, for a sensor 36 mm wide
 
 
 def framing(centre: np.ndarray, size: np.ndarray, towards: Vector, slope: float) -> np.ndarray:
-    """The point towards which a 16:9 picture, `slope` wide to each side at distance 1, has the whole box in it."""
+    """Where a camera stands, in the direction `towards` from a box, to have all of it in a 16:9 picture.
+
+    slope is half the picture's width over its distance.
+    """
     right, up, back = np.array(towards.to_track_quat("Z", "Y").to_matrix()).T
     corners = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * size
     across, high = np.abs(corners @ right) / slope, np.abs(corners @ up) / (slope * 9 / 16)
