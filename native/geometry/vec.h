@@ -73,15 +73,12 @@ struct Box3f {
     constexpr bool is_empty() const { return !(lower.x <= upper.x && lower.y <= upper.y && lower.z <= upper.z); }
     constexpr Vec3f size() const { return upper - lower; }
 
-    constexpr void extend(Vec3f p) {
-        for (int axis = 0; axis < 3; ++axis) {
-            lower[axis] = std::min(lower[axis], p[axis]);
-            upper[axis] = std::max(upper[axis], p[axis]);
-        }
-    }
+    constexpr void extend(Vec3f p) { extend(Box3f{p, p}); }
     constexpr void extend(const Box3f& b) {
-        extend(b.lower);
-        extend(b.upper);
+        for (int axis = 0; axis < 3; ++axis) {
+            lower[axis] = std::min(lower[axis], b.lower[axis]);
+            upper[axis] = std::max(upper[axis], b.upper[axis]);
+        }
     }
     friend constexpr bool operator==(const Box3f&, const Box3f&) = default;
 };

@@ -9,7 +9,8 @@
 
 namespace espalier {
 
-/// Points origin + t direction with t_min <= t <= t_max; 0 <= t_min. The direction need not have unit length.
+/// Points origin + t direction with t_min <= t <= t_max; 0 <= t_min. The direction need not have
+/// unit length, but its largest component must lie between 2^-100 and 2^100.
 struct Ray {
     Vec3f origin;
     float t_min;

@@ -1,0 +1,118 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+// Phase 1: the boxes of the faces that can be hit. Compiled once per instruction set (see build_kernels.cpp).
+
+#if defined(ESPALIER_KDTREE_BOUNDS_INL_H_) == defined(HWY_TARGET_TOGGLE)
+#ifdef ESPALIER_KDTREE_BOUNDS_INL_H_
+#undef ESPALIER_KDTREE_BOUNDS_INL_H_
+#else
+#define ESPALIER_KDTREE_BOUNDS_INL_H_
+#endif
+
+#include <hwy/highway.h>
+
+#include "geometry/triangle.h"
+#include "kdtree/build_kernels.h"
+
+HWY_BEFORE_NAMESPACE();
+namespace espalier::HWY_NAMESPACE {
+namespace hn = hwy::HWY_NAMESPACE;
+
+/// Writes the reference of one face that passed or failed as `fault` says.
+inline void make_reference(const TriangleSoup& soup, uint32_t triangle, const References& out, uint32_t& count,
+                           RejectedFaces& rejected) {
+    const Vec3f v0 = soup.vertex(triangle, 0);
+    const Vec3f v1 = soup.vertex(triangle, 1);
+    const Vec3f v2 = soup.vertex(triangle, 2);
+    switch (classify_face(v0, v1, v2)) {
+        case FaceFault::kNotFinite: ++rejected.not_finite; return;
+        case FaceFault::kTooLarge: ++rejected.too_large; return;
+        case FaceFault::kNoArea: ++rejected.no_area; return;
+        case FaceFault::kNone: break;
+    }
+    for (size_t axis = 0; axis < 3; ++axis) {
+        const int a = static_cast<int>(axis);
+        // Adding +0 turns -0 into +0, so that minima of equal zeros have one bit pattern whatever the order.
+        out.lower[axis][count] = std::min({v0[a], v1[a], v2[a]}) + 0.0F;
+        out.upper[axis][count] = std::max({v0[a], v1[a], v2[a]}) + 0.0F;
+    }
+    out.triangle[count++] = triangle;
+}
+
+inline uint32_t make_references(const TriangleSoup& soup, uint32_t begin, uint32_t end, const References& out, Box3f& bounds,
+                                RejectedFaces& rejected) {
+    const hn::ScalableTag<float> df;
+    const hn::RebindToSigned<decltype(df)> di;
+    const hn::RebindToUnsigned<decltype(df)> du;
+    using F = hn::Vec<decltype(df)>;
+    const uint32_t lanes = static_cast<uint32_t>(hn::Lanes(df));
+    const auto zero = hn::Zero(df);
+    const auto limit = hn::Set(df, kMaxCoordinate);
+    // |computed - exact| of a cross product component is below 4 u (|ab| + |cd|); twice that leaves no doubt.
+    const auto relative_error = hn::Set(df, 0x1p-21F);
+    const auto smallest_sure = hn::Set(df, 0x1p-100F);
+
+    F lowest[3] = {hn::Inf(df), hn::Inf(df), hn::Inf(df)};
+    F highest[3] = {hn::Neg(hn::Inf(df)), hn::Neg(hn::Inf(df)), hn::Neg(hn::Inf(df))};
+    uint32_t count = 0;
+    uint32_t triangle = begin;
+    for (; triangle + lanes <= end; triangle += lanes) {
+        hn::Vec<decltype(du)> corner[3];
+        hn::LoadInterleaved3(du, soup.triangles.data() + size_t{3} * triangle, corner[0], corner[1], corner[2]);
+        F v[3][3];
+        auto valid = hn::Eq(zero, zero);
+        for (int k = 0; k < 3; ++k) {
+            const auto index = hn::BitCast(di, hn::Add(corner[k], hn::Add(corner[k], corner[k])));
+            for (int axis = 0; axis < 3; ++axis) {
+                v[k][axis] = hn::Add(hn::GatherIndex(df, soup.positions.data() + axis, index), zero);
+                valid = hn::And(valid, hn::Le(hn::Abs(v[k][axis]), limit));
+            }
+        }
+        auto has_area = hn::Lt(zero, zero);
+        for (int axis = 0; axis < 3; ++axis) {
+            const int x = (axis + 1) % 3;
+            const int y = (axis + 2) % 3;
+            const auto a = hn::Mul(hn::Sub(v[1][x], v[0][x]), hn::Sub(v[2][y], v[0][y]));
+            const auto b = hn::Mul(hn::Sub(v[1][y], v[0][y]), hn::Sub(v[2][x], v[0][x]));
+            const auto bound = hn::Add(hn::Mul(hn::Add(hn::Abs(a), hn::Abs(b)), relative_error), smallest_sure);
+            has_area = hn::Or(has_area, hn::Gt(hn::Abs(hn::Sub(a, b)), bound));
+        }
+        if (!hn::AllTrue(df, hn::And(valid, has_area))) {
+            for (uint32_t lane = 0; lane < lanes; ++lane) {
+                const uint32_t at = count;
+                make_reference(soup, triangle + lane, out, count, rejected);
+                if (count > at) {
+                    bounds.extend(out.box(at));
+                }
+            }
+            continue;
+        }
+        for (size_t axis = 0; axis < 3; ++axis) {
+            const auto low = hn::Min(v[0][axis], hn::Min(v[1][axis], v[2][axis]));
+            const auto high = hn::Max(v[0][axis], hn::Max(v[1][axis], v[2][axis]));
+            hn::StoreU(low, df, out.lower[axis] + count);
+            hn::StoreU(high, df, out.upper[axis] + count);
+            lowest[axis] = hn::Min(lowest[axis], low);
+            highest[axis] = hn::Max(highest[axis], high);
+        }
+        hn::StoreU(hn::Iota(du, triangle), du, out.triangle + count);
+        count += lanes;
+    }
+    for (; triangle < end; ++triangle) {
+        const uint32_t at = count;
+        make_reference(soup, triangle, out, count, rejected);
+        if (count > at) {
+            bounds.extend(out.box(at));
+        }
+    }
+    Box3f seen;
+    for (int axis = 0; axis < 3; ++axis) {
+        seen.lower[axis] = hn::GetLane(hn::MinOfLanes(df, lowest[axis]));
+        seen.upper[axis] = hn::GetLane(hn::MaxOfLanes(df, highest[axis]));
+    }
+    bounds.extend(seen);
+    return count;
+}
+
+}  // namespace espalier::HWY_NAMESPACE
+HWY_AFTER_NAMESPACE();
+#endif

@@ -1,0 +1,117 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+#include "kdtree/build_kernels.h"
+
+#include "kdtree/simd_config.h"
+#include "kdtree/simd_target.h"
+
+#undef HWY_TARGET_INCLUDE
+#define HWY_TARGET_INCLUDE "kdtree/build_kernels.cpp"
+#include <hwy/foreach_target.h>
+// Highway's own header has to follow foreach_target.h.
+#include <hwy/highway.h>
+
+#include "kdtree/binning-inl.h"
+#include "kdtree/bounds-inl.h"
+#include "kdtree/partition-inl.h"
+#include "kdtree/small_node-inl.h"
+
+HWY_BEFORE_NAMESPACE();
+namespace espalier::HWY_NAMESPACE {
+
+/// Splits one node after the other, depth first. Left children stay where their parent's references lay, right ones wait behind.
+class SubtreeBuilder {
+   public:
+    SubtreeBuilder(const SubtreeInput& input, const OpenNode& root, SubtreeOutput& output)
+        : input_(input), output_(output), soft_limit_(size_t{2} * root.count) {}
+
+    /// Builds below a node whose references begin at `begin`; from `room` on there is space for right children.
+    void build(const OpenNode& node, size_t begin, size_t room) {
+        const References references = input_.references->references().at(begin);
+        if (node.count <= kSmallNode) {
+            const SmallNode finish(references, node, *input_.parameters, output_);
+            return;
+        }
+        if (input_.cancel != nullptr && input_.cancel->load(std::memory_order_relaxed)) {
+            throw BuildCancelled();
+        }
+        BinCounts counts{};
+        count_bins(references, node.count, node.tight, input_.parameters->bins, counts);
+        const Split split = choose_split(node, counts, *input_.parameters);
+        if (split.axis < 0 || room + node.count > input_.references->capacity()) {
+            write_leaf(node, references);
+            return;
+        }
+        Partition parts;
+        size_t right_begin = begin;
+        size_t right_room = room;
+        if (!cuts_empty_space(node, split, parts)) {
+            parts = partition(*input_.soup, references, node.count, split, input_.parameters->clip, references,
+                              input_.references->references().at(room));
+            right_begin = room;
+            right_room = room + parts.right_count;
+        }
+        OpenNode left;
+        OpenNode right;
+        open_children(node, split, parts, left, right);
+
+        const size_t index = output_.nodes.size();
+        output_.nodes.push_back(KdNode::leaf(0, 0));
+        output_.boxes.emplace_back();
+        build(left, begin, right_room);
+        if (right_room > soft_limit_ && right_begin != begin) {  // the parent's place is free: take it
+            move_references(right_begin, begin, right.count);
+            right_begin = begin;
+            right_room = room;
+        }
+        const size_t right_child = output_.nodes.size();
+        build(right, right_begin, right_room);
+        output_.nodes[index] = KdNode::inner(split.axis, split.position, static_cast<uint32_t>(right_child));
+        Box3f box = output_.boxes[index + 1];
+        box.extend(output_.boxes[right_child]);
+        output_.boxes[index] = box;
+    }
+
+   private:
+    void write_leaf(const OpenNode& node, const References& references) {
+        LeafWriter leaf(output_, node.count);
+        for (uint32_t i = 0; i < node.count; ++i) {
+            leaf.add(references.triangle[i]);
+        }
+        leaf.finish(node.tight);
+    }
+
+    void move_references(size_t from, size_t to, uint32_t count) {
+        copy_references(input_.references->references().at(from), count, input_.references->references().at(to));
+    }
+
+    const SubtreeInput& input_;
+    SubtreeOutput& output_;
+    size_t soft_limit_;  ///< beyond this much of the room, waiting references are moved down
+};
+
+void build_subtree(const SubtreeInput& input, const OpenNode& node, SubtreeOutput& output) {
+    SubtreeBuilder(input, node, output).build(node, 0, node.count);
+}
+
+constexpr BuildKernels kKernels{make_references, count_bins, choose_split, partition, build_subtree};
+
+}  // namespace espalier::HWY_NAMESPACE
+HWY_AFTER_NAMESPACE();
+
+#if HWY_ONCE
+namespace espalier {
+
+const BuildKernels& build_kernels() {
+    switch (simd_target()) {
+#if defined(__x86_64__)
+        case HWY_AVX3_DL: return N_AVX3_DL::kKernels;
+        case HWY_AVX2: return N_AVX2::kKernels;
+        default: return N_SSE4::kKernels;
+#else
+        default: return N_NEON::kKernels;
+#endif
+    }
+}
+
+}  // namespace espalier
+#endif

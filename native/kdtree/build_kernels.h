@@ -1,0 +1,121 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+#pragma once
+
+#include <atomic>
+#include <vector>
+
+#include "kdtree/node.h"
+#include "kdtree/references.h"
+#include "kdtree/tree.h"
+
+namespace espalier {
+
+/// What the quality modes differ in.
+struct BuildParameters {
+    SahConstants sah;
+    int bins;   ///< per axis, in nodes of more than kSmallNode references
+    bool clip;  ///< whether straddlers' boxes are cut to the part of the triangle on each side
+};
+
+/// A node of at most this many references is finished as one bit mask per plane and side.
+constexpr uint32_t kSmallNode = 64;
+constexpr int kMaxBins = 32;
+
+/// A node that is yet to be split.
+struct OpenNode {
+    Box3f cell;      ///< what the planes above leave of the scene's box
+    Box3f tight;     ///< of the references' boxes
+    uint32_t count;  ///< references
+    uint64_t spare;  ///< references that its splits may still add: what bounds the memory of hostile scenes
+    int depth;
+};
+
+/// References that begin before plane j, and that end behind it, per axis. Counts add up over parts of a node.
+struct BinCounts {
+    uint32_t left[3][kMaxBins];
+    uint32_t right[3][kMaxBins];
+};
+
+struct Split {
+    int axis = -1;  ///< -1: the node is a leaf
+    float position = 0;
+};
+
+struct Partition {
+    uint32_t left_count = 0;
+    uint32_t right_count = 0;
+    Box3f left_tight;
+    Box3f right_tight;
+};
+
+/// The subtrees that one thread builds. Child and block indices count from the beginning of these arrays.
+struct SubtreeOutput {
+    std::vector<KdNode> nodes;
+    std::vector<Box3f> boxes;         ///< tight, per node
+    std::vector<uint32_t> triangles;  ///< kBlockSize per block, padded with kNoTriangle
+};
+
+/// What one thread needs while it builds a subtree.
+struct SubtreeInput {
+    const TriangleSoup* soup;
+    const BuildParameters* parameters;
+    const std::atomic<bool>* cancel;
+    const ReferenceBuffer* references;  ///< the node's own, at the start; everything behind them is room for right children
+};
+
+/// References that a subtree may need room for at once: its own, the right children that wait, and one partition in progress.
+inline size_t subtree_room(uint32_t count, uint64_t spare) {
+    return size_t{4} * count + size_t{2} * spare;
+}
+
+/// The inner loops of the builder, compiled once for each instruction set. All give the same tree bit for bit.
+struct BuildKernels {
+    /// Writes a reference for each valid face of [begin, end) to `out`; returns how many, extends `bounds`, counts the others.
+    uint32_t (*make_references)(const TriangleSoup& soup, uint32_t begin, uint32_t end, const References& out, Box3f& bounds,
+                                RejectedFaces& rejected);
+    /// Adds part of a node's references to its counts.
+    void (*count_bins)(const References& references, uint32_t count, const Box3f& tight, int bins, BinCounts& counts);
+    /// The plane of least cost by the surface area heuristic, or a leaf.
+    Split (*choose_split)(const OpenNode& node, const BinCounts& counts, const BuildParameters& parameters);
+    /// Sorts references by side, in order; those on both sides go to both. `left` may be `in` itself.
+    Partition (*partition)(const TriangleSoup& soup, const References& in, uint32_t count, Split split, bool clip,
+                           const References& left, const References& right);
+    /// Appends everything below a node to the output. Throws BuildCancelled.
+    void (*build_subtree)(const SubtreeInput& input, const OpenNode& node, SubtreeOutput& output);
+};
+
+/// The kernels for the instruction set in use (see simd_target.h).
+const BuildKernels& build_kernels();
+
+/// Shares out what a split leaves of the node's spare references, by count.
+inline void share_spare(const OpenNode& parent, OpenNode& left, OpenNode& right) {
+    const uint64_t both = uint64_t{left.count} + right.count;
+    const uint64_t added = both > parent.count ? both - parent.count : 0;
+    const uint64_t rest = parent.spare > added ? parent.spare - added : 0;
+    left.spare = both == 0 ? 0 : rest * left.count / both;
+    right.spare = rest - left.spare;
+}
+
+/// True for a plane at an end of the tight box, which has all references on one side: nothing needs to be partitioned.
+inline bool cuts_empty_space(const OpenNode& node, Split split, Partition& parts) {
+    if (split.position <= node.tight.lower[split.axis]) {
+        parts = {0, node.count, {}, node.tight};
+        return true;
+    }
+    if (split.position >= node.tight.upper[split.axis]) {
+        parts = {node.count, 0, node.tight, {}};
+        return true;
+    }
+    return false;
+}
+
+/// The two nodes that a split makes of one.
+inline void open_children(const OpenNode& parent, Split split, const Partition& parts, OpenNode& left, OpenNode& right) {
+    left = {parent.cell, parts.left_tight, parts.left_count, 0, parent.depth + 1};
+    right = {parent.cell, parts.right_tight, parts.right_count, 0, parent.depth + 1};
+    left.cell.upper[split.axis] = split.position;
+    right.cell.lower[split.axis] = split.position;
+    share_spare(parent, left, right);
+}
+
+}  // namespace espalier

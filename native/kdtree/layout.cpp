@@ -1,0 +1,269 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+#include "kdtree/layout.h"
+
+#include <algorithm>
+#include <array>
+#include <bit>
+#include <vector>
+
+#include "kdtree/parallel.h"
+
+namespace espalier {
+namespace {
+
+/// A run of kd nodes that forms one subtree, laid out by one thread. Where the tree is cut into such runs depends on the tree
+/// alone, so that the layout is the same for any number of threads.
+struct Run {
+    uint32_t begin;
+    uint32_t end;
+    uint32_t first_block;
+    uint32_t end_block;
+    std::vector<WideNode> wide;
+    uint32_t first_wide = 0;
+};
+
+uint32_t run_length(size_t nodes) {
+    return static_cast<uint32_t>(std::max<size_t>(512, nodes / 256));
+}
+
+/// Something that may become a child of a wide node: a kd node, or part of a kd leaf too large for one child.
+struct Item {
+    uint32_t node;
+    uint32_t first_block;  ///< of a leaf
+    uint32_t blocks;       ///< of a leaf; 0 for an inner node
+    float area;
+    Box3f box;
+};
+
+class Collapse {
+   public:
+    Collapse(const Tree& tree, const LargeBuffer<Box3f>& boxes) : tree_(tree), boxes_(boxes) {}
+
+    /// Appends the wide node for a kd node and all below it; returns its index. A kd node listed in `runs` is not entered: its child code
+    /// is the index of its run, marked for the caller to resolve.
+    uint32_t collapse(uint32_t kd_node, std::vector<WideNode>& out, const std::vector<Run>* runs) const {
+        return collapse(item(kd_node), out, runs);
+    }
+
+   private:
+    struct Opened {
+        int axis;
+        int left;   ///< slot of the left part; -1 if it is empty
+        int right;
+    };
+
+    Item item(uint32_t node) const {
+        const KdNode kd = tree_.nodes[node];
+        const Box3f& box = boxes_[node];
+        const Vec3f size = box.size();
+        Item made{node, 0, 0, size.x * size.y + size.y * size.z + size.z * size.x, box};
+        if (kd.is_leaf()) {
+            made.first_block = kd.first_block();
+            made.blocks = block_count(kd.references());
+        }
+        return made;
+    }
+
+    static bool is_empty(const Tree& tree, uint32_t node) { return tree.nodes[node].is_leaf() && tree.nodes[node].references() == 0; }
+
+    static const Run* find_run(const std::vector<Run>* runs, uint32_t node) {
+        if (runs == nullptr) {
+            return nullptr;
+        }
+        const auto found = std::lower_bound(runs->begin(), runs->end(), node, [](const Run& run, uint32_t n) { return run.begin < n; });
+        return found != runs->end() && found->begin == node ? &*found : nullptr;
+    }
+
+    uint32_t collapse(const Item& root, std::vector<WideNode>& out, const std::vector<Run>* runs) const {
+        std::array<Item, WideNode::kWidth> items;
+        // Per octant the slots of `items` from the nearest to the farthest.
+        std::array<std::array<uint8_t, WideNode::kWidth>, 8> order{};
+        int count = 1;
+        items[0] = root;
+        for (;;) {
+            const int slot = next_to_open(items, count, root.node, runs);
+            if (slot < 0) {
+                break;
+            }
+            open(items, count, slot, order);
+        }
+
+        const auto index = static_cast<uint32_t>(out.size());
+        out.emplace_back();
+        WideNode made{};
+        for (int i = 0; i < WideNode::kWidth; ++i) {
+            const Box3f box = i < count ? items[static_cast<size_t>(i)].box : Box3f{};
+            for (int axis = 0; axis < 3; ++axis) {
+                made.lower[axis][i] = box.lower[axis];
+                made.upper[axis][i] = box.upper[axis];
+            }
+        }
+        for (size_t octant = 0; octant < 8; ++octant) {
+            uint32_t word = 0;
+            for (int rank = 0; rank < count; ++rank) {
+                word |= uint32_t{order[octant][static_cast<size_t>(rank)]} << (3 * (WideNode::kWidth - 1 - rank));
+            }
+            // Unused slots come first, that is farthest: no ray meets them, but each slot has to appear once.
+            for (int slot = count; slot < WideNode::kWidth; ++slot) {
+                word |= static_cast<uint32_t>(slot) << (3 * (WideNode::kWidth - 1 - slot));
+            }
+            made.order[octant] = word;
+        }
+        for (int i = 0; i < count; ++i) {
+            const Item& child = items[static_cast<size_t>(i)];
+            if (child.blocks != 0 && child.blocks <= WideNode::kMaxLeafBlocks) {
+                made.child[i] = WideNode::leaf(child.first_block, child.blocks);
+            } else if (const Run* run = child.blocks == 0 ? find_run(runs, child.node) : nullptr; run != nullptr) {
+                made.child[i] = run->first_wide;
+            } else {
+                made.child[i] = collapse(child, out, runs);
+            }
+        }
+        out[index] = made;
+        return index;
+    }
+
+    /// The child of largest area that can be opened, or -1.
+    static int next_to_open(const std::array<Item, WideNode::kWidth>& items, int count, uint32_t root, const std::vector<Run>* runs) {
+        if (count == WideNode::kWidth) {
+            return -1;
+        }
+        int best = -1;
+        for (int i = 0; i < count; ++i) {
+            const Item& candidate = items[static_cast<size_t>(i)];
+            const bool is_inner = candidate.blocks == 0 && (candidate.node == root || find_run(runs, candidate.node) == nullptr);
+            const bool is_long_leaf = candidate.blocks > WideNode::kMaxLeafBlocks;
+            if ((is_inner || is_long_leaf) && (best < 0 || candidate.area > items[static_cast<size_t>(best)].area)) {
+                best = i;
+            }
+        }
+        return best;
+    }
+
+    /// Replaces an item by its two parts, the near one first in each octant's order.
+    void open(std::array<Item, WideNode::kWidth>& items, int& count, int slot,
+              std::array<std::array<uint8_t, WideNode::kWidth>, 8>& order) const {
+        const Item opened = items[static_cast<size_t>(slot)];
+        int axis = 0;
+        if (opened.blocks != 0) {
+            Item first = opened;
+            first.blocks = opened.blocks / 2;
+            Item second = opened;
+            second.first_block += first.blocks;
+            second.blocks -= first.blocks;
+            items[static_cast<size_t>(slot)] = first;
+            items[static_cast<size_t>(count)] = second;
+        } else {
+            const KdNode kd = tree_.nodes[opened.node];
+            const uint32_t left = opened.node + 1;
+            const uint32_t right = kd.right_child();
+            axis = kd.axis();
+            if (is_empty(tree_, left) || is_empty(tree_, right)) {  // an empty leaf takes no place
+                items[static_cast<size_t>(slot)] = item(is_empty(tree_, left) ? right : left);
+                return;
+            }
+            items[static_cast<size_t>(slot)] = item(left);
+            items[static_cast<size_t>(count)] = item(right);
+        }
+        for (unsigned octant = 0; octant < 8; ++octant) {
+            auto& ranks = order[octant];
+            const auto place = std::find(ranks.begin(), ranks.begin() + count, static_cast<uint8_t>(slot));
+            std::copy_backward(place + 1, ranks.begin() + count, ranks.begin() + count + 1);
+            const bool from_right = (octant >> axis & 1U) != 0;
+            *place = static_cast<uint8_t>(from_right ? count : slot);
+            *(place + 1) = static_cast<uint8_t>(from_right ? slot : count);
+        }
+        ++count;
+    }
+
+    const Tree& tree_;
+    const LargeBuffer<Box3f>& boxes_;
+};
+
+/// Lists the runs below a node in depth-first order.
+void find_runs(const Tree& tree, uint32_t begin, uint32_t end, uint32_t longest, std::vector<Run>& runs) {
+    const KdNode node = tree.nodes[begin];
+    if (node.is_leaf()) {
+        return;  // the node above takes it as it is
+    }
+    if (end - begin <= longest) {
+        runs.push_back({begin, end, 0, 0, {}});
+        return;
+    }
+    find_runs(tree, begin + 1, node.right_child(), longest, runs);
+    find_runs(tree, node.right_child(), end, longest, runs);
+}
+
+void write_block(const TriangleSoup& soup, const uint32_t* triangles, TriangleBlock& block) {
+    for (uint32_t lane = 0; lane < kBlockSize; ++lane) {
+        const uint32_t triangle = triangles[lane];
+        block.triangle[lane] = triangle;
+        for (int corner = 0; corner < 3; ++corner) {
+            const Vec3f v = triangle == kNoTriangle ? Vec3f{NAN, NAN, NAN} : soup.vertex(triangle, corner);
+            for (int axis = 0; axis < 3; ++axis) {
+                block.vertex[corner][axis][lane] = v[axis];
+            }
+        }
+    }
+}
+
+}  // namespace
+
+void build_layout(const TriangleSoup& soup, const LargeBuffer<Box3f>& boxes, const LargeBuffer<uint32_t>& triangles, int threads,
+                  Tree& tree) {
+    constexpr size_t kBlocksPerTask = 512;
+    const size_t blocks = triangles.size() / kBlockSize;
+    tree.blocks = LargeBuffer<TriangleBlock>(blocks);
+    const auto nodes = static_cast<uint32_t>(tree.nodes.size());
+    if (blocks == 0) {
+        return;
+    }
+    std::vector<Run> runs;
+    find_runs(tree, 0, nodes, run_length(nodes), runs);
+
+    const Collapse collapse(tree, boxes);
+    const size_t block_tasks = (blocks + kBlocksPerTask - 1) / kBlocksPerTask;
+    parallel_for(threads, runs.size() + block_tasks, [&](size_t i) {
+        if (i < runs.size()) {
+            runs[i].wide.reserve((runs[i].end - runs[i].begin) / 6);
+            collapse.collapse(runs[i].begin, runs[i].wide, nullptr);
+            return;
+        }
+        const size_t begin = (i - runs.size()) * kBlocksPerTask;
+        for (size_t b = begin; b < std::min(begin + kBlocksPerTask, blocks); ++b) {
+            write_block(soup, triangles.data() + b * kBlockSize, tree.blocks[b]);
+        }
+    });
+
+    // The wide nodes above the runs, whose number is small. A tree that is one run has none.
+    std::vector<WideNode> top;
+    const bool is_one_run = runs.size() == 1 && runs[0].begin == 0;
+    const auto place_runs = [&](uint32_t first) {
+        for (Run& run : runs) {
+            run.first_wide = first;
+            first += static_cast<uint32_t>(run.wide.size());
+        }
+        return first;
+    };
+    if (!is_one_run) {
+        collapse.collapse(0, top, &runs);  // once to learn its size, which the runs' places depend on
+        place_runs(static_cast<uint32_t>(top.size()));
+        top.clear();
+        collapse.collapse(0, top, &runs);
+    }
+    tree.wide_nodes = LargeBuffer<WideNode>(place_runs(static_cast<uint32_t>(top.size())));
+    std::copy(top.begin(), top.end(), tree.wide_nodes.data());
+    parallel_for(threads, runs.size(), [&](size_t i) {
+        for (size_t n = 0; n < runs[i].wide.size(); ++n) {
+            WideNode& wide = tree.wide_nodes[runs[i].first_wide + n];
+            wide = runs[i].wide[n];
+            for (int child = 0; child < WideNode::kWidth; ++child) {
+                if ((wide.child[child] & WideNode::kLeafFlag) == 0) {
+                    wide.child[child] += runs[i].first_wide;
+                }
+            }
+        }
+    });
+}
+
+}  // namespace espalier

@@ -1,0 +1,205 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+#include "kdtree/top_levels.h"
+
+#include <algorithm>
+
+#include "kdtree/parallel.h"
+
+namespace espalier {
+namespace {
+
+/// Small enough to share out among many threads, large enough that a segment is still worth a vector loop a few levels down.
+uint32_t choose_segment_size(uint32_t triangles) {
+    return std::clamp<uint32_t>(triangles / 64, 1024, 8192);
+}
+
+/// Segments keep a quarter of their size free, so that most right halves fit behind their left ones although straddlers go to both.
+/// Vector code may touch up to kMargin items behind the last one, which must then be no other segment's.
+constexpr uint32_t kMargin = 16;
+uint32_t with_slack(uint32_t count) {
+    return count + count / 4 + 2 * kMargin;
+}
+
+/// Levels that may move every right half elsewhere before the buffer is full. Pages that are not used are never taken.
+constexpr size_t kBufferLevels = 12;
+
+void add(const BinCounts& part, BinCounts& sum) {
+    for (int axis = 0; axis < 3; ++axis) {
+        for (int j = 0; j < kMaxBins; ++j) {
+            sum.left[axis][j] += part.left[axis][j];
+            sum.right[axis][j] += part.right[axis][j];
+        }
+    }
+}
+
+}  // namespace
+
+TopLevels::TopLevels(const TriangleSoup& soup, const BuildParameters& parameters, const std::atomic<bool>* cancel, int threads)
+    : soup_(soup),
+      parameters_(parameters),
+      cancel_(cancel),
+      threads_(threads),
+      kernels_(build_kernels()),
+      segment_size_(choose_segment_size(soup.size())),
+      references_(kBufferLevels * (size_t{2} * soup.size() + segment_size_)) {}
+
+void TopLevels::make_references() {
+    const uint32_t triangles = soup_.size();
+    const size_t count = (triangles + segment_size_ - 1) / segment_size_;
+    std::vector<Box3f> bounds(count);
+    std::vector<RejectedFaces> rejected(count);
+    TopNode root{};
+    root.segments.resize(count);
+    parallel_for(threads_, count, [&](size_t i) {
+        const auto begin = static_cast<uint32_t>(i * segment_size_);
+        const uint32_t end = std::min(begin + segment_size_, triangles);
+        const size_t place = i * with_slack(segment_size_);
+        const uint32_t made =
+            kernels_.make_references(soup_, begin, end, references_.references().at(place), bounds[i], rejected[i]);
+        root.segments[i] = {place, made, with_slack(segment_size_)};
+    });
+    used_ = count * with_slack(segment_size_);
+
+    Box3f box;
+    uint32_t valid = 0;
+    for (size_t i = 0; i < count; ++i) {
+        box.extend(bounds[i]);
+        valid += root.segments[i].count;
+        rejected_.not_finite += rejected[i].not_finite;
+        rejected_.too_large += rejected[i].too_large;
+        rejected_.no_area += rejected[i].no_area;
+    }
+    root.node = {box, box, valid, spare_references(triangles), 0};
+    nodes_.push_back(std::move(root));
+}
+
+std::vector<TopLevels::Part> TopLevels::parts_of(const std::vector<uint32_t>& nodes) const {
+    std::vector<Part> parts;
+    for (const uint32_t node : nodes) {
+        for (uint32_t i = 0; i < nodes_[node].segments.size(); ++i) {
+            parts.push_back({node, i});
+        }
+    }
+    return parts;
+}
+
+void TopLevels::split_above(uint32_t cut) {
+    std::vector<uint32_t> level{0};
+    for (;;) {
+        std::erase_if(level, [&](uint32_t node) { return nodes_[node].node.count <= std::max(cut, kSmallNode); });
+        size_t references = 0;
+        for (const uint32_t node : level) {
+            references += nodes_[node].node.count;
+        }
+        const std::vector<Part> parts = parts_of(level);
+        // Whatever is left unsplit here becomes a subtree: who builds a node does not change the tree.
+        if (level.empty() || used_ + 2 * references + parts.size() * 2 * kMargin > references_.capacity()) {
+            return;
+        }
+        if (cancel_ != nullptr && cancel_->load(std::memory_order_relaxed)) {
+            throw BuildCancelled();
+        }
+        choose_splits(level, parts);
+        level = open_level(level, parts);
+    }
+}
+
+void TopLevels::choose_splits(const std::vector<uint32_t>& level, const std::vector<Part>& parts) {
+    std::vector<BinCounts> counts(parts.size());
+    parallel_for(threads_, parts.size(), [&](size_t i) {
+        const TopNode& top = nodes_[parts[i].node];
+        const Segment& segment = top.segments[parts[i].segment];
+        counts[i] = {};
+        kernels_.count_bins(references_.references().at(segment.begin), segment.count, top.node.tight, parameters_.bins, counts[i]);
+    });
+    size_t first = 0;
+    for (const uint32_t node : level) {
+        TopNode& top = nodes_[node];
+        BinCounts sum{};
+        for (const size_t end = first + top.segments.size(); first < end; ++first) {
+            add(counts[first], sum);
+        }
+        top.split = kernels_.choose_split(top.node, sum, parameters_);
+    }
+}
+
+Partition TopLevels::partition_segment(const TopNode& top, const Segment& segment, const References& scratch, Segment& left,
+                                       Segment& right) {
+    const References here = references_.references().at(segment.begin);
+    const Partition parts =
+        kernels_.partition(soup_, here, segment.count, top.split, parameters_.clip, here, scratch);
+    const uint32_t both = parts.left_count + parts.right_count;
+    if (both + 2 * kMargin <= segment.capacity) {
+        const uint32_t left_capacity = parts.left_count + (segment.capacity - both) / 2;
+        left = {segment.begin, parts.left_count, left_capacity};
+        right = {segment.begin + left_capacity, parts.right_count, segment.capacity - left_capacity};
+    } else {
+        const uint32_t capacity = with_slack(parts.right_count);
+        left = {segment.begin, parts.left_count, segment.capacity};
+        right = {used_.fetch_add(capacity, std::memory_order_relaxed), parts.right_count, capacity};
+    }
+    copy_references(scratch, parts.right_count, references_.references().at(right.begin));
+    return parts;
+}
+
+std::vector<uint32_t> TopLevels::open_level(const std::vector<uint32_t>& level, const std::vector<Part>& parts) {
+    std::vector<ReferenceBuffer> scratch(static_cast<size_t>(threads_));
+    std::vector<Partition> results(parts.size());
+    std::vector<Segment> left(parts.size());
+    std::vector<Segment> right(parts.size());
+    parallel_for(threads_, parts.size(), [&](size_t i, int worker) {
+        const TopNode& top = nodes_[parts[i].node];
+        Partition whole;
+        if (!top.is_split() || cuts_empty_space(top.node, top.split, whole)) {
+            return;
+        }
+        ReferenceBuffer& mine = scratch[static_cast<size_t>(worker)];
+        if (mine.references().triangle == nullptr) {
+            mine = ReferenceBuffer(with_slack(segment_size_) * size_t{2});
+        }
+        results[i] = partition_segment(top, top.segments[parts[i].segment], mine.references(), left[i], right[i]);
+    });
+
+    std::vector<uint32_t> next;
+    size_t first = 0;
+    for (const uint32_t index : level) {
+        const size_t end = first + nodes_[index].segments.size();
+        if (nodes_[index].is_split()) {
+            TopNode left_child{};
+            TopNode right_child{};
+            Partition whole;
+            if (cuts_empty_space(nodes_[index].node, nodes_[index].split, whole)) {
+                (whole.left_count == 0 ? right_child : left_child).segments = std::move(nodes_[index].segments);
+            } else {
+                for (size_t i = first; i < end; ++i) {
+                    whole.left_count += results[i].left_count;
+                    whole.right_count += results[i].right_count;
+                    whole.left_tight.extend(results[i].left_tight);
+                    whole.right_tight.extend(results[i].right_tight);
+                    left_child.segments.push_back(left[i]);
+                    right_child.segments.push_back(right[i]);
+                }
+            }
+            open_children(nodes_[index].node, nodes_[index].split, whole, left_child.node, right_child.node);
+            nodes_[index].segments.clear();
+            nodes_[index].left = static_cast<uint32_t>(nodes_.size());
+            nodes_[index].right = nodes_[index].left + 1;
+            next.push_back(nodes_[index].left);
+            next.push_back(nodes_[index].right);
+            nodes_.push_back(std::move(left_child));
+            nodes_.push_back(std::move(right_child));
+        }
+        first = end;
+    }
+    return next;
+}
+
+void TopLevels::gather(const TopNode& node, const References& to) const {
+    size_t place = 0;
+    for (const Segment& segment : node.segments) {
+        copy_references(references_.references().at(segment.begin), segment.count, to.at(place));
+        place += segment.count;
+    }
+}
+
+}  // namespace espalier

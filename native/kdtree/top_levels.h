@@ -1,0 +1,71 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+#pragma once
+
+#include <memory>
+#include <vector>
+
+#include "kdtree/build_kernels.h"
+
+namespace espalier {
+
+/// A run of a node's references in the shared buffer. A node of the top levels is a list of them, in order.
+struct Segment {
+    size_t begin;
+    uint32_t count;
+    uint32_t capacity;
+};
+
+/// A node of the top of the tree: split further, or the root of a subtree.
+struct TopNode {
+    OpenNode node;
+    Split split;
+    uint32_t left = 0;   ///< index among the top nodes, if split
+    uint32_t right = 0;
+    std::vector<Segment> segments;
+
+    bool is_split() const { return split.axis >= 0; }
+};
+
+/// Phases 1 and 2: the references and the top of the tree, all threads on one level at a time.
+class TopLevels {
+   public:
+    TopLevels(const TriangleSoup& soup, const BuildParameters& parameters, const std::atomic<bool>* cancel, int threads);
+
+    /// Phase 1: boxes of all faces that can be hit.
+    void make_references();
+    /// Phase 2: splits every node of more than `cut` references, breadth first.
+    void split_above(uint32_t cut);
+
+    const std::vector<TopNode>& nodes() const { return nodes_; }
+    const RejectedFaces& rejected() const { return rejected_; }
+    /// Copies a node's references into one piece.
+    void gather(const TopNode& node, const References& to) const;
+
+   private:
+    struct Part {
+        uint32_t node;
+        uint32_t segment;
+    };
+    std::vector<Part> parts_of(const std::vector<uint32_t>& nodes) const;
+    void choose_splits(const std::vector<uint32_t>& level, const std::vector<Part>& parts);
+    std::vector<uint32_t> open_level(const std::vector<uint32_t>& level, const std::vector<Part>& parts);
+    Partition partition_segment(const TopNode& node, const Segment& segment, const References& scratch, Segment& left, Segment& right);
+
+    const TriangleSoup& soup_;
+    const BuildParameters& parameters_;
+    const std::atomic<bool>* cancel_;
+    const int threads_;
+    const BuildKernels& kernels_;
+    const uint32_t segment_size_;
+    ReferenceBuffer references_;
+    std::atomic<size_t> used_{0};
+    std::vector<TopNode> nodes_;
+    RejectedFaces rejected_;
+};
+
+/// Room for the splits of the whole tree to add references, however hostile the scene: 6 for each triangle.
+inline uint64_t spare_references(uint32_t triangles) {
+    return uint64_t{6} * triangles + 1024;
+}
+
+}  // namespace espalier
