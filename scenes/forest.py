@@ -251,10 +251,7 @@ def build() -> None:
     undergrowth(random)
     meadow()
     cabin()
-    light("SUN", "#ffdcae", 4.2, (-60, -25, 42), (0, 20, 0), angle=0.02)
-    # The sky: two suns without shadows stand in for light from all round, since only direct light is traced.
-    light("SUN", "#9cc0ff", 0.55, (40, -60, 90), (0, 0, 0), use_shadow=False)
-    light("SUN", "#b4cdf5", 0.35, (20, 60, 50), (0, 0, 0), use_shadow=False)
+    light("SUN", "#ffdcae", 3.5, (-60, -25, 42), (0, 20, 0), angle=0.02)
     camera((3, -9, 6.4), (1.5, 40, 3.6), 30)
 
 

@@ -66,9 +66,6 @@ def load(source: Path, up: str = "Y", inside: bool = False) -> None:
         light(
             "AREA", "#b8cdf0", 6 * size**2, centre + size * np.array([1.2, -0.8, 0.4]), centre, shape="DISK", size=size
         )
-        light(
-            "AREA", "#ffd9b0", 4 * size**2, centre + size * np.array([-1.0, 0.6, 0.9]), centre, shape="DISK", size=size
-        )
     bpy.context.scene.camera.data.clip_start = size / 1000
 
 
