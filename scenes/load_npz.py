@@ -48,7 +48,7 @@ def load(source: Path, up: str = "Y", inside: bool = False) -> None:
         points = np.stack([points[:, 0], -points[:, 2], points[:, 1]], axis=1)
     low, high = points.min(axis=0), points.max(axis=0)
     centre, size = (low + high) / 2, float(np.linalg.norm(high - low))
-    picture("#8d97a3")
+    picture("#68717c")
     if inside:
         x, y, z = high - low
         eye = np.array([low[0] + 0.08 * x, centre[1], low[2] + 0.12 * z])

@@ -99,7 +99,7 @@ def test_the_interior_has_every_kind_of_light_and_many_kinds_of_object(bpy: Modu
     assert counts["pear"] == 26
     assert sum(counts[thing.name] for thing in bpy.data.collections["books"].objects) == 10 * 15
     assert (np.linalg.det(arrays.matrices[:, :3, :3]) < 0).sum() >= 5 * 15, "no mirrored copies"
-    assert {None, 2, 3} == {mesh.normals if mesh.normals is None else mesh.normals.ndim for mesh in arrays.meshes}
+    assert {mesh.normals is None for mesh in arrays.meshes} == {True, False}, "not both flat and smooth"
     rug = next(mesh for mesh in arrays.meshes if mesh.name == "rug")
     assert rug.slot_count == 7
 
