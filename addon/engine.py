@@ -34,7 +34,8 @@ class ESPALIER_engine(bpy.types.RenderEngine):
         except Cancelled:
             pass
         except Exception as error:  # Blender would print it and call the render finished
-            self.error_set(str(error))
+            self.error_set(str(error))  # for the picture's place
+            self.report({"ERROR"}, str(error))  # for the operator, which a script hears
 
     def _draw_frame(self, depsgraph: bpy.types.Depsgraph) -> None:
         self.update_stats("", "Exporting")

@@ -70,5 +70,5 @@ def world_triangles(arrays: Any) -> np.ndarray:
 def ordered(triangles: np.ndarray) -> np.ndarray:
     """The same triangles, sorted by their coordinates."""
     keys = np.round(triangles.reshape(len(triangles), 9), 4) + 0.0
-    order: np.ndarray = np.lexsort(keys.T[::-1])
-    return triangles[order]
+    found: np.ndarray = triangles[np.lexsort(keys.T[::-1])]
+    return found
