@@ -3,13 +3,16 @@
 
 #include <algorithm>
 #include <array>
+#include <cmath>
 #include <limits>
 #include <memory>
+#include <optional>
 #include <set>
 #include <vector>
 
 #include "module/arrays.h"
 #include "module/bindings.h"
+#include "module/docs.h"
 #include "module/fields.h"
 #include "module/reports.h"
 
@@ -81,7 +84,7 @@ LightInput light_input(const Fields& fields) {
     return light;
 }
 
-std::vector<Light> lights_from(const py::list& list, Vec3d scene_centre) {
+std::vector<Light> lights_from(const py::sequence& list, Vec3d scene_centre) {
     std::vector<Light> lights;
     for (size_t i = 0; i < list.size(); ++i) {
         const Fields fields(list[i], "lights", i);
@@ -94,7 +97,7 @@ std::vector<Light> lights_from(const py::list& list, Vec3d scene_centre) {
     return lights;
 }
 
-std::shared_ptr<Job> start_preview(const std::shared_ptr<Scene>& scene, const py::dict& camera, const py::list& lights,
+std::shared_ptr<Job> start_preview(const std::shared_ptr<Scene>& scene, py::handle camera, const py::sequence& lights,
                                    const std::array<double, 3>& world_color, int width, int height,
                                    const std::string& quality, int threads, int samples) {
     require_between(width, 1, kMaxSide, "width");
@@ -162,77 +165,39 @@ py::object image_of(const Job& job) {
     return image_array(preview->film());
 }
 
-py::dict render(const std::shared_ptr<Scene>& scene, const py::dict& camera, const py::list& lights,
+py::dict render(const std::shared_ptr<Scene>& scene, py::handle camera, const py::sequence& lights,
                 const std::array<double, 3>& world_color, int width, int height, const std::string& quality,
                 int threads, int samples) {
     return result_of(*start_preview(scene, camera, lights, world_color, width, height, quality, threads, samples));
 }
 
-constexpr const char* kPictureArguments =
-    "camera: dict with type 'PERSP' or 'ORTHO', matrix_world: float64 [4, 4] and projection: float64 [4, 4] in "
-    "OpenGL's\n"
-    "convention; its clip range holds. lights: dicts with type 'POINT', 'SUN', 'SPOT' or 'AREA', matrix: float64 [4, "
-    "4]\n"
-    "(it shines along its -Z), color: linear RGB, energy: W (sun: W/m2), shadow: bool; point and spot: radius in m; "
-    "sun:\n"
-    "angle in rad; spot: spot_size in rad, spot_blend 0..1; area: shape 'SQUARE', 'RECTANGLE', 'DISK' or 'ELLIPSE', "
-    "size\n"
-    "and size_y in m. world_color: linear RGB of the background, which also lights the scene. Without lights a soft "
-    "sky\n"
-    "does. width, height: pixels. quality: of the tree. threads: 0 for all; the image is the same, bit for bit, for "
-    "any\n"
-    "number. samples: rays per pixel.\n"
-    "Result: image float32 [H, W, 4] linear RGBA, bottom row first; build: a Tree's report; trace: trace_ms, threads,\n"
-    "samples, primary_rays, shadow_rays, mrays_per_s; placing_ms; objects: as Scene.objects.\n"
-    "Raises TypeError, ValueError or IndexError naming the argument.";
-
 }  // namespace
 
 void bind_jobs(py::module_& module) {
-    py::register_exception<JobCancelled>(module, "Cancelled", PyExc_RuntimeError).doc() =
-        "Raised by Job.result() of a job that was cancelled.";
-    py::class_<Job, std::shared_ptr<Job>>(
-        module, "Job", "Work that a native thread does in the background. Dropping the last reference cancels it.")
-        .def_property_readonly("progress", &Job::progress, "From 0 to 1, never falling.")
+    py::register_exception<JobCancelled>(module, "Cancelled", PyExc_RuntimeError).doc() = docs::kCancelled;
+    py::class_<Job, std::shared_ptr<Job>>(module, "Job", docs::kJob)
+        .def_property_readonly("progress", &Job::progress, docs::kProgress)
         .def_property_readonly(
-            "stage", [](const Job& job) { return stage_name(job.stage()); },
-            "'placing', 'building', 'tracing', 'comparing', 'done', 'cancelled' or 'failed'.")
-        .def_property_readonly("done", &Job::done, "True once the job has ended, in whatever way.")
-        .def("cancel", &Job::cancel, "Asks the job to stop; it ends soon after, and result() then raises Cancelled.")
-        .def("wait", &wait_for_job, "timeout"_a = py::none(),
-             "Waits until the job has ended, for at most `timeout` seconds; returns done.")
-        .def("result", &result_of,
-             "Waits for the job's end and returns its result; raises Cancelled or the job's error.")
-        .def("image", &image_of,
-             "What a preview has finished so far: float32 [H, W, 4], linear RGBA, bottom row first, transparent black "
-             "where\n"
-             "nothing is yet. None before the first tile, and for other jobs.");
+            "stage", [](const Job& job) { return stage_name(job.stage()); }, docs::kStage)
+        .def_property_readonly("done", &Job::done, docs::kDone)
+        .def("cancel", &Job::cancel, docs::kCancel)
+        .def("wait", &wait_for_job, "timeout"_a = py::none(), docs::kWait)
+        .def("result", &result_of, docs::kResult)
+        .def("image", &image_of, docs::kImage);
 
-    static const std::string preview_doc =
-        std::string("Starts building a scene's tree and drawing its picture, and returns at once.\n\n") +
-        kPictureArguments;
-    static const std::string render_doc =
-        std::string("Builds a scene's tree, draws its picture and returns the result.\n\n") + kPictureArguments;
     module.def("start_preview", &start_preview, "scene"_a, "camera"_a, "lights"_a, "world_color"_a, "width"_a,
                "height"_a, py::kw_only(), "quality"_a = "balanced", "threads"_a = 0, "samples"_a = 4,
-               preview_doc.c_str());
+               docs::kStartPreview);
     module.def("render", &render, "scene"_a, "camera"_a, "lights"_a, "world_color"_a, "width"_a, "height"_a,
-               py::kw_only(), "quality"_a = "balanced", "threads"_a = 0, "samples"_a = 4, render_doc.c_str());
-    module.def(
-        "start_compare", &start_compare, "scene"_a, "thread_counts"_a, py::kw_only(), "quality"_a = "balanced",
-        "repeats"_a = 5,
-        "Starts timing the build of a scene's tree, serial and with each number of threads, interleaved.\n\n"
-        "thread_counts: positive, none twice. repeats: builds per row, of which medians are taken.\n"
-        "Result: triangles; serial: a row; threads: one row per number, in order. A row is a Tree's report whose "
-        "times\n"
-        "are medians, with build_ms_min, build_ms_max, repeats, speed_up (over serial), efficiency (speed_up per\n"
-        "thread), mtri_per_s and references_per_triangle.");
+               py::kw_only(), "quality"_a = "balanced", "threads"_a = 0, "samples"_a = 4, docs::kRender);
+    module.def("start_compare", &start_compare, "scene"_a, "thread_counts"_a, py::kw_only(), "quality"_a = "balanced",
+               "repeats"_a = 5, docs::kStartCompare);
 
-    module.attr("_at_exit") = py::cpp_function([] {
+    // At the interpreter's exit no thread may be left working on what is about to go.
+    py::module_::import("atexit").attr("register")(py::cpp_function([] {
         const py::gil_scoped_release release;
         stop_all_jobs();
-    });
-    py::module_::import("atexit").attr("register")(module.attr("_at_exit"));
+    }));
 }
 
 }  // namespace espalier

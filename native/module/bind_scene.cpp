@@ -1,11 +1,12 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-#include <pybind11/stl.h>
-
+#include <cmath>
+#include <limits>
 #include <memory>
 #include <vector>
 
 #include "module/arrays.h"
 #include "module/bindings.h"
+#include "module/docs.h"
 #include "module/fields.h"
 #include "module/reports.h"
 #include "render/scene.h"
@@ -64,7 +65,7 @@ Placement placement_from(const Fields& fields) {
     return placement;
 }
 
-std::shared_ptr<Scene> make_scene(const py::list& meshes, const py::list& placements, py::handle materials) {
+std::shared_ptr<Scene> make_scene(const py::sequence& meshes, const py::sequence& placements, py::handle materials) {
     std::vector<HeldMesh> held;
     for (size_t i = 0; i < meshes.size(); ++i)
         held.push_back(mesh_from(Fields(meshes[i], "meshes", i)));
@@ -86,34 +87,18 @@ std::shared_ptr<Scene> make_scene(const py::list& meshes, const py::list& placem
 }  // namespace
 
 void bind_scene(py::module_& module) {
-    py::class_<Scene, std::shared_ptr<Scene>>(
-        module, "Scene",
-        "Placed meshes, flattened to world triangles: formed in double relative to the scene's centre, rounded "
-        "once.\n\n"
-        "Immutable; it copies what it needs, so the arrays may change or go afterwards.")
-        .def(py::init(&make_scene), "meshes"_a, "placements"_a, "materials"_a,
-             "meshes: dicts with name: str, positions: float32 [N, 3], triangles: int32 or uint32 [M, 3],\n"
-             "normals: None (flat), float32 [N, 3] (per vertex) or float32 [M, 3, 3] (per corner), in object space,\n"
-             "material_slots: None or int32 [M], the slot of each triangle.\n"
-             "placements: dicts with object: str, mesh: index into meshes, matrix: float64 [4, 4], object to world\n"
-             "(negative scale allowed), materials: int32 [S], at least one: the material of each slot; a slot beyond "
-             "takes\n"
-             "the last. materials: float32 [K, 3], linear base colours.\n"
-             "Raises TypeError, ValueError or IndexError naming the mesh or the object.")
-        .def_property_readonly("triangle_count", &Scene::triangle_count, "World triangles, rejected faces included.")
-        .def_property_readonly(
-            "centre",
-            [](const Scene& scene) {
-                const Vec3d centre = scene.centre();
-                py::array_t<double> array(3);
-                for (int axis = 0; axis < 3; ++axis)
-                    array.mutable_at(axis) = centre[axis];
-                return array;
-            },
-            "The middle of the world bounds, float64 [3]: the point that world triangles are relative to.")
-        .def_property_readonly(
-            "objects", &objects_list,
-            "One dict per object name: object, triangles, rejected_faces {not_finite, no_area, too_large}.");
+    const auto centre = [](const Scene& scene) {
+        py::array_t<double> array(3);
+        for (int axis = 0; axis < 3; ++axis) {
+            array.mutable_at(axis) = scene.centre()[axis];
+        }
+        return array;
+    };
+    py::class_<Scene, std::shared_ptr<Scene>>(module, "Scene", docs::kScene)
+        .def(py::init(&make_scene), "meshes"_a, "placements"_a, "materials"_a, docs::kSceneInit)
+        .def_property_readonly("triangle_count", &Scene::triangle_count, docs::kTriangleCount)
+        .def_property_readonly("centre", centre, docs::kCentre)
+        .def_property_readonly("objects", &objects_list, docs::kObjects);
 }
 
 }  // namespace espalier

@@ -2,13 +2,16 @@
 #include <algorithm>
 #include <atomic>
 #include <cmath>
+#include <cstring>
 #include <limits>
 #include <memory>
+#include <vector>
 
 #include "kdtree/parallel.h"
 #include "kdtree/traversal.h"
 #include "module/arrays.h"
 #include "module/bindings.h"
+#include "module/docs.h"
 #include "module/reports.h"
 
 namespace py = pybind11;
@@ -87,13 +90,18 @@ class RayInput {
         return {{o[0], o[1], o[2]}, t_min_[i], {d[0], d[1], d[2]}, t_max_[i]};
     }
 
+    static float largest_component(Vec3f v) { return std::max({std::abs(v.x), std::abs(v.y), std::abs(v.z)}); }
+
     static const char* fault(const Ray& ray) {
         if (!is_finite(ray.origin))
             return "origins is not finite";
         if (!is_finite(ray.direction))
             return "directions is not finite";
-        if (ray.direction == Vec3f{})
+        const float size = largest_component(ray.direction);
+        if (size == 0.0F)
             return "directions is zero";
+        if (size < 0x1p-100F || size > 0x1p100F)
+            return "directions must have its largest component between 2^-100 and 2^100";
         if (!(ray.t_min >= 0.0F) || std::isinf(ray.t_min))
             return "t_min must be finite and not negative";
         if (!(ray.t_max >= ray.t_min))
@@ -170,42 +178,17 @@ py::dict tree_arrays(const Tree& tree) {
 }  // namespace
 
 void bind_tree(py::module_& module) {
-    py::class_<Tree>(module, "Tree",
-                     "A kd-tree over triangles, made by build(). It keeps its own copy of them and never changes.")
+    constexpr double kInfinity = std::numeric_limits<double>::infinity();
+    py::class_<Tree>(module, "Tree", docs::kTree)
         .def_property_readonly(
-            "report", [](const Tree& tree) { return report_dict(tree.report); },
-            "What the build took and what came of it.\n\n"
-            "build_ms and phases_ms {bounds, top_levels, subtrees, compaction, layout}: wall-clock milliseconds.\n"
-            "threads, triangles (as given), nodes, leaves, empty_leaves, references (of leaves to triangles), "
-            "wide_nodes,\n"
-            "bytes. sah_cost: expected cost of a ray that meets the scene's box, in the units of sah_constants.\n"
-            "checksum: 16 hexadecimal digits, the same for any number of threads.\n"
-            "rejected_faces {not_finite, no_area, too_large}: faces that no ray can hit, left out of the tree.")
-        .def("intersect", &intersect_rays, "origins"_a, "directions"_a, "t_min"_a = 0.0,
-             "t_max"_a = std::numeric_limits<double>::infinity(), "threads"_a = 0,
-             "The nearest hit of each ray with t_min <= t <= t_max; of equal distances the lowest triangle.\n\n"
-             "origins, directions: float32 [R, 3]; a direction need not have unit length, t counts in directions.\n"
-             "t_min, t_max: a number, or float32 [R] with one per ray. threads: 0 for all.\n"
-             "Returns t float32 [R] (inf at a miss), triangle int32 [R] (-1 at a miss), u and v float32 [R] (0 at a "
-             "miss):\n"
-             "the point is (1-u-v) v0 + u v1 + v v2. Raises TypeError for another dtype, ValueError for another shape, "
-             "a\n"
-             "ray that is not finite, a zero direction, a negative t_min or t_max < t_min.")
-        .def("occluded", &occluded_rays, "origins"_a, "directions"_a, "t_min"_a = 0.0,
-             "t_max"_a = std::numeric_limits<double>::infinity(), "threads"_a = 0,
-             "Whether each ray hits anything with t_min <= t <= t_max: bool [R]. Arguments and errors as of "
-             "intersect().")
-        .def("arrays", &tree_arrays,
-             "Copies of the tree's own arrays, for comparing trees.\n\n"
-             "nodes: uint64 [K], depth first. wide_nodes: uint8 [W, 256]. blocks of eight triangles: uint8 [B, 320].");
+            "report", [](const Tree& tree) { return report_dict(tree.report); }, docs::kReport)
+        .def("intersect", &intersect_rays, "origins"_a, "directions"_a, "t_min"_a = 0.0, "t_max"_a = kInfinity,
+             "threads"_a = 0, docs::kIntersect)
+        .def("occluded", &occluded_rays, "origins"_a, "directions"_a, "t_min"_a = 0.0, "t_max"_a = kInfinity,
+             "threads"_a = 0, docs::kOccluded)
+        .def("arrays", &tree_arrays, docs::kArrays);
     module.def("build", &build_tree, "vertices"_a, "triangles"_a, "quality"_a = "balanced", "threads"_a = 0,
-               "Builds a kd-tree over triangles.\n\n"
-               "vertices: float32 [N, 3], any values. triangles: int32 or uint32 [M, 3], indices into vertices.\n"
-               "quality: 'draft', 'balanced' or 'best': how long to look for good splits, never what a ray hits.\n"
-               "threads: 0 for all; the tree is the same, bit for bit, for any number.\n"
-               "Faces that are not finite, have no area or lie beyond 2^60 are counted in the report and left out.\n"
-               "Raises TypeError for another dtype, ValueError for another shape, quality or number of threads,\n"
-               "IndexError for an index out of range.");
+               docs::kBuild);
 }
 
 }  // namespace espalier

@@ -6,7 +6,7 @@
 #include <exception>
 #include <memory>
 #include <mutex>
-#include <optional>
+#include <stdexcept>
 #include <thread>
 
 namespace espalier {

@@ -4,20 +4,14 @@
 #include "kdtree/parallel.h"
 #include "kdtree/simd_target.h"
 #include "module/bindings.h"
+#include "module/docs.h"
 
 PYBIND11_MODULE(espalier_native, module) {
-    module.doc() =
-        "Ray casting with kd-trees that are built on every core. NumPy arrays in, NumPy arrays out; no Blender "
-        "needed.\n\n"
-        "build() makes a Tree over triangles, to be asked for hits. Scene, render(), start_preview() and "
-        "start_compare()\n"
-        "draw placed meshes with a camera and lights, and time the building.";
+    namespace docs = espalier::docs;
+    module.doc() = docs::kModule;
     module.attr("__version__") = ESPALIER_VERSION;
-    module.def("simd_targets", &espalier::simd_target_names,
-               "The instruction sets this machine can run, best first; the first is used.\n\n"
-               "The environment variable ESPALIER_SIMD, set to one of them before the first call, forces that one.");
-    module.def("hardware_threads", &espalier::hardware_threads,
-               "How many threads this process may run at the same time: what threads=0 stands for.");
+    module.def("simd_targets", &espalier::simd_target_names, docs::kSimdTargets);
+    module.def("hardware_threads", &espalier::hardware_threads, docs::kHardwareThreads);
     espalier::bind_tree(module);
     espalier::bind_scene(module);
     espalier::bind_jobs(module);

@@ -93,16 +93,13 @@ std::optional<LightSample> Light::sample_bulb(Vec3d point, Vec3d normal, Sample2
     const double distance = length(from_light);
     if (!(distance > 0.0))
         return std::nullopt;
-    const double falloff = spot_ ? spot_falloff(from_light) : 1.0;
-    if (falloff <= 0.0)
-        return std::nullopt;
-
     const Sample2 disk = sample_disk(s);
     const Tangents side = tangents(from_light / distance);
     const Vec3d to_light = (side.x * disk.x + side.y * disk.y) * radius_ - from_light;
     const double square = dot(to_light, to_light);
     const double tilt = dot(normal, to_light);
-    if (tilt <= 0.0)
+    const double falloff = spot_ ? spot_falloff(-to_light) : 1.0;
+    if (tilt <= 0.0 || falloff <= 0.0)
         return std::nullopt;
     // The cosine at the disk is distance / |to_light|, the one at the surface tilt / |to_light|.
     return LightSample{to_light, false, strength_ * (falloff * distance * tilt / (square * square))};
