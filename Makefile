@@ -21,11 +21,11 @@ ADDON := blender_manifest.toml $(wildcard addon/*.py)
 export PATH := $(CURDIR)/.venv/bin:$(PATH)
 
 preview: native $(if $(filter build/scenes/%,$(SCENE)),$(SCENE))
-	mkdir -p build/preview
-	python -m addon.cli preview "$(SCENE)" --output build/preview/preview.png --json build/preview/timings.json
+	@python -c 'import sys; from addon.cli import main; sys.exit(main(sys.argv[1:]))' preview "$(SCENE)" \
+		--output build/preview/preview.png --json build/preview/timings.json
 
 build/scenes/%.blend: scenes/%.py scenes/kit.py | python
-	mkdir -p build/scenes
+	@mkdir -p build/scenes
 	python $< $@
 
 test: test-native native package

@@ -50,7 +50,7 @@ def build_wheel(python: Path, version: str) -> Path:
 
 
 def stage(wheels: list[Path]) -> None:
-    """Lays the extension out as it is in the zip; its manifest also lists the wheels"""
+    """Lays the extension out as it is in the zip; its manifest lists the wheels that are there"""
     shutil.rmtree(STAGE, ignore_errors=True)
     shutil.copytree(ROOT / "addon", STAGE, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "LICENSE", STAGE)
@@ -58,9 +58,10 @@ def stage(wheels: list[Path]) -> None:
     for wheel in wheels:
         shutil.copy(wheel, STAGE / "wheels")
     names = "".join(f'  "./wheels/{wheel.name}",\n' for wheel in wheels)
-    manifest = (ROOT / "blender_manifest.toml").read_text(encoding="utf-8")
-    top, tables, rest = manifest.partition("\n[")  # the list belongs above the first table
-    (STAGE / "blender_manifest.toml").write_text(f"{top}wheels = [\n{names}]\n{tables}{rest}", encoding="utf-8")
+    before, found, after = (ROOT / "blender_manifest.toml").read_text(encoding="utf-8").partition("wheels = []")
+    if not found:
+        raise SystemExit("blender_manifest.toml: found no line “wheels = []” to fill in")
+    (STAGE / "blender_manifest.toml").write_text(f"{before}wheels = [\n{names}]{after}", encoding="utf-8")
 
 
 def main() -> None:
