@@ -1,0 +1,51 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+#include <gtest/gtest.h>
+
+#include <stdexcept>
+#include <vector>
+
+#include "kdtree/parallel.h"
+
+namespace espalier {
+namespace {
+
+TEST(Parallel, VisitsEachIndexOnce) {
+    for (const int threads : {1, 2, 5, 16}) {
+        for (const size_t count : {0U, 1U, 7U, 1000U}) {
+            std::vector<std::atomic<int>> visits(count);
+            parallel_for(threads, count, [&](size_t i, int worker) {
+                EXPECT_GE(worker, 0);
+                EXPECT_LT(worker, threads);
+                ++visits[i];
+            });
+            for (const auto& visit : visits) {
+                EXPECT_EQ(visit, 1);
+            }
+        }
+    }
+}
+
+TEST(Parallel, PassesOnTheFirstException) {
+    std::atomic<int> after{0};
+    EXPECT_THROW(parallel_for(4, 100000,
+                              [&](size_t i) {
+                                  if (i == 10) {
+                                      throw std::runtime_error("ten");
+                                  }
+                                  after += i > 90000 ? 1 : 0;
+                              }),
+                 std::runtime_error);
+    EXPECT_EQ(after, 0) << "the rest is not begun";
+    int sum = 0;
+    parallel_for(1, 4, [&](size_t i) { sum += static_cast<int>(i); });
+    EXPECT_EQ(sum, 6);
+}
+
+TEST(Parallel, CanBeNested) {
+    std::atomic<int> count{0};
+    parallel_for(3, 8, [&](size_t) { parallel_for(3, 8, [&](size_t) { ++count; }); });
+    EXPECT_EQ(count, 64);
+}
+
+}  // namespace
+}  // namespace espalier

@@ -1,0 +1,256 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+#include <gtest/gtest.h>
+
+#include <cstring>
+#include <functional>
+#include <thread>
+
+#include "kdtree/traversal.h"
+#include "meshes.h"
+
+namespace espalier {
+namespace {
+
+constexpr Quality kQualities[] = {Quality::kDraft, Quality::kBalanced, Quality::kBest};
+
+template <class T>
+bool same_bytes(const LargeBuffer<T>& a, const LargeBuffer<T>& b) {
+    return a.size() == b.size() && (a.size() == 0 || std::memcmp(a.data(), b.data(), a.bytes()) == 0);
+}
+
+/// The kd-tree's own rules: depth first, every split inside its cell, every node and block in place exactly once.
+void expect_well_formed(const Tree& tree) {
+    uint32_t next_block = 0;
+    const std::function<uint32_t(uint32_t, Box3f, int)> visit = [&](uint32_t index, Box3f cell, int depth) -> uint32_t {
+        EXPECT_LE(depth, tree.report.sah_constants.max_depth);
+        const KdNode node = tree.nodes[index];
+        if (node.is_leaf()) {
+            EXPECT_EQ(node.first_block(), next_block);
+            next_block += block_count(node.references());
+            for (uint32_t i = 0; i < block_count(node.references()) * kBlockSize; ++i) {
+                const TriangleBlock& block = tree.blocks[node.first_block() + i / kBlockSize];
+                EXPECT_EQ(block.triangle[i % kBlockSize] == kNoTriangle, i >= node.references());
+            }
+            return index + 1;
+        }
+        EXPECT_GT(node.split(), cell.lower[node.axis()]);
+        EXPECT_LT(node.split(), cell.upper[node.axis()]);
+        Box3f left = cell;
+        left.upper[node.axis()] = node.split();
+        Box3f right = cell;
+        right.lower[node.axis()] = node.split();
+        EXPECT_EQ(visit(index + 1, left, depth + 1), node.right_child());
+        return visit(node.right_child(), right, depth + 1);
+    };
+    EXPECT_EQ(visit(0, tree.bounds, 0), tree.nodes.size());
+    EXPECT_EQ(next_block, tree.blocks.size());
+}
+
+/// Calls f(first block, blocks, box) for every leaf that rays can reach.
+void for_each_leaf(const Tree& tree, const std::function<void(uint32_t, uint32_t, const Box3f&)>& f) {
+    const std::function<void(uint32_t)> visit = [&](uint32_t index) {
+        const WideNode& node = tree.wide_nodes[index];
+        for (int i = 0; i < WideNode::kWidth; ++i) {
+            const Box3f box{{node.lower[0][i], node.lower[1][i], node.lower[2][i]}, {node.upper[0][i], node.upper[1][i], node.upper[2][i]}};
+            if (box.is_empty()) {
+                continue;
+            }
+            if ((node.child[i] & WideNode::kLeafFlag) != 0) {
+                f(WideNode::first_block(node.child[i]), WideNode::blocks(node.child[i]), box);
+            } else {
+                visit(node.child[i]);
+            }
+        }
+    };
+    if (tree.wide_nodes.size() != 0) {
+        visit(0);
+    }
+}
+
+bool contains(const Box3f& box, Vec3d p) {
+    for (int axis = 0; axis < 3; ++axis) {
+        if (!(box.lower[axis] <= p[axis] && p[axis] <= box.upper[axis])) {
+            return false;
+        }
+    }
+    return true;
+}
+
+/// Points of every triangle lie in a box that holds the triangle: no clipping may cut anything away. A point formed in double is off the
+/// triangle by less than 2^-50 of its coordinates, the boxes' margin is 2^-22 of them; corners are exact.
+void expect_everything_covered(const Mesh& mesh, const Tree& tree) {
+    const TriangleSoup soup = mesh.soup();
+    std::vector<std::vector<Box3f>> boxes(soup.size());
+    for_each_leaf(tree, [&](uint32_t first, uint32_t blocks, const Box3f& box) {
+        for (uint32_t b = first; b < first + blocks; ++b) {
+            for (const uint32_t triangle : tree.blocks[b].triangle) {
+                if (triangle != kNoTriangle) {
+                    boxes[triangle].push_back(box);
+                }
+            }
+        }
+    });
+    const double weights[][2] = {{0, 0}, {1, 0}, {0, 1}, {0.5, 0.5}, {0.5, 0}, {0.125, 0.25}, {1 / 3., 1 / 3.}, {0, 0.3}, {0.875, 0.0625}};
+    uint32_t uncovered = 0;
+    for (uint32_t i = 0; i < soup.size(); ++i) {
+        for (const auto& w : weights) {
+            const Vec3d corner = to_double(soup.vertex(i, 0));
+            const Vec3d p = corner + (to_double(soup.vertex(i, 1)) - corner) * w[0] + (to_double(soup.vertex(i, 2)) - corner) * w[1];
+            uncovered += std::none_of(boxes[i].begin(), boxes[i].end(), [&](const Box3f& box) { return contains(box, p); }) ? 1U : 0U;
+        }
+    }
+    EXPECT_EQ(uncovered, 0U);
+}
+
+Mesh moved(Mesh mesh, float offset, float scale) {
+    for (float& x : mesh.positions) {
+        x = x * scale + offset;
+    }
+    return mesh;
+}
+
+TEST(Tree, IsWellFormedAndCoversEveryTriangle) {
+    const Mesh meshes[] = {make_sphere(40, 60), make_soup(3000, 1), make_furball(400), make_grid(40),
+                           moved(make_sphere(30, 40), 1e5F, 1), moved(make_soup(2000, 2), 0, 1e-30F), moved(make_soup(2000, 3), -3, 1e15F)};
+    for (const Mesh& mesh : meshes) {
+        for (const Quality quality : kQualities) {
+            const Tree tree = build(mesh.soup(), {quality, 1});
+            expect_well_formed(tree);
+            expect_everything_covered(mesh, tree);
+        }
+    }
+}
+
+TEST(Tree, IsTheSameForEveryThreadCount) {
+    const Mesh meshes[] = {make_sphere(120, 200), make_soup(40000, 4), make_furball(3000), make_grid(150)};
+    for (const Mesh& mesh : meshes) {
+        for (const Quality quality : kQualities) {
+            const Tree serial = build(mesh.soup(), {quality, 1});
+            for (const int threads : {2, 3, 4, 8, 16}) {
+                const Tree parallel = build(mesh.soup(), {quality, threads});
+                EXPECT_TRUE(same_bytes(serial.nodes, parallel.nodes)) << threads;
+                EXPECT_TRUE(same_bytes(serial.wide_nodes, parallel.wide_nodes)) << threads;
+                EXPECT_TRUE(same_bytes(serial.blocks, parallel.blocks)) << threads;
+                EXPECT_EQ(serial.report.checksum, parallel.report.checksum);
+                EXPECT_EQ(serial.bounds, parallel.bounds);
+            }
+        }
+    }
+}
+
+TEST(Tree, ReportAddsUp) {
+    const Mesh mesh = make_sphere(60, 90);
+    const Tree tree = build(mesh.soup(), {Quality::kBalanced, 2});
+    const BuildReport& report = tree.report;
+    EXPECT_EQ(report.nodes, tree.nodes.size());
+    EXPECT_EQ(report.leaves, (report.nodes + 1) / 2);
+    EXPECT_EQ(report.triangles, mesh.triangles.size() / 3);
+    EXPECT_GE(report.references, report.triangles);
+    EXPECT_EQ(report.threads, 2);
+    EXPECT_GT(report.sah_cost, report.sah_constants.traversal);
+    const PhaseTimes& phases = report.phases_ms;
+    const double sum = phases.bounds + phases.top_levels + phases.subtrees + phases.compaction + phases.layout;
+    EXPECT_LE(sum, report.build_ms);
+    EXPECT_GT(sum, 0.9 * report.build_ms);
+    EXPECT_NE(report.checksum, build(make_sphere(60, 91).soup(), {Quality::kBalanced, 2}).report.checksum);
+}
+
+TEST(Tree, TakesMeshesOfAlmostNothing) {
+    for (const int threads : {1, 2}) {
+        for (uint32_t count = 0; count <= 3; ++count) {
+            const Mesh mesh = make_soup(count, 5);
+            const Tree tree = build(mesh.soup(), {Quality::kBalanced, threads});
+            EXPECT_EQ(tree.report.references, count);
+            expect_well_formed(tree);
+            const Ray ray{{0.5F, 0.5F, 5}, 0, {0, 0, 1}, INFINITY};
+            Hit hit{};
+            intersect(tree, {&ray, 1}, {&hit, 1});
+            EXPECT_EQ(hit.triangle, -1);
+        }
+    }
+}
+
+TEST(Tree, SetsBadFacesAsideAndCountsThem) {
+    for (const int threads : {1, 2}) {
+        Mesh mesh = make_sphere(20, 30);
+        const auto sound = static_cast<uint32_t>(mesh.triangles.size() / 3);
+        mesh.add_triangle({0, 0, NAN}, {1, 0, 0}, {0, 1, 0});
+        mesh.add_triangle({0, 0, 0}, {INFINITY, 0, 0}, {0, 1, 0});
+        mesh.add_triangle({0, 0, 0}, {1e30F, 0, 0}, {0, 1, 0});
+        mesh.add_triangle({1, 2, 3}, {1, 2, 3}, {1, 2, 3});
+        mesh.add_triangle({0, 0, 0}, {1, 1, 1}, {3, 3, 3});
+        mesh.add_triangle({0, 0, 0}, {0x1p-60F, 0x1p-60F, 0}, {0x1p-59F, 0x1p-60F, 0});  // tiny, but it has an area
+        const Tree tree = build(mesh.soup(), {Quality::kBalanced, threads});
+        EXPECT_EQ(tree.report.rejected_faces.not_finite, 2U);
+        EXPECT_EQ(tree.report.rejected_faces.too_large, 1U);
+        EXPECT_EQ(tree.report.rejected_faces.no_area, 2U);
+        EXPECT_LE(tree.bounds.upper.x, 1.0F);
+        std::vector<bool> held(mesh.triangles.size() / 3);
+        for_each_leaf(tree, [&](uint32_t first, uint32_t blocks, const Box3f&) {
+            for (uint32_t b = first; b < first + blocks; ++b) {
+                for (const uint32_t triangle : tree.blocks[b].triangle) {
+                    if (triangle != kNoTriangle) {
+                        held[triangle] = true;
+                    }
+                }
+            }
+        });
+        for (uint32_t i = 0; i < held.size(); ++i) {
+            EXPECT_EQ(held[i], i < sound || i == held.size() - 1) << i;
+        }
+    }
+}
+
+TEST(Tree, BoundsItsReferencesOnHostileScenes) {
+    Mesh copies;
+    for (int i = 0; i < 100000; ++i) {
+        copies.add_triangle({0, 0, 0}, {1, 0, 0.5F}, {0, 1, 0});
+    }
+    Mesh coplanar = make_soup(100000, 6, 1);
+    for (size_t i = 2; i < coplanar.positions.size(); i += 3) {
+        coplanar.positions[i] = 0.25F;
+    }
+    const Mesh meshes[] = {copies, coplanar, make_furball(60000)};
+    for (const Mesh& mesh : meshes) {
+        const Tree tree = build(mesh.soup(), {Quality::kBalanced, 2});
+        EXPECT_LE(tree.report.references, uint64_t{7} * tree.report.triangles + 1024);
+        expect_well_formed(tree);
+    }
+    const Tree tree = build(copies.soup(), {Quality::kBalanced, 2});
+    const Ray ray{{0.25F, 0.25F, -1}, 0, {0, 0, 1}, INFINITY};
+    Hit hit{};
+    intersect(tree, {&ray, 1}, {&hit, 1});
+    EXPECT_EQ(hit.triangle, 0) << "of equal distances the lowest index wins";
+}
+
+TEST(Tree, CanBeCancelled) {
+    const Mesh mesh = make_soup(200000, 8);
+    const std::atomic<bool> cancelled{true};
+    for (const int threads : {1, 2}) {
+        EXPECT_THROW(build(mesh.soup(), {Quality::kBalanced, threads, &cancelled}), BuildCancelled);
+    }
+    std::atomic<bool> later{false};
+    std::thread canceller([&] {
+        std::this_thread::sleep_for(std::chrono::milliseconds(3));
+        later = true;
+    });
+    EXPECT_THROW(build(mesh.soup(), {Quality::kBest, 2, &later}), BuildCancelled);
+    canceller.join();
+}
+
+TEST(Tree, CanBeBuiltByManyThreadsAtOnce) {
+    const Mesh mesh = make_sphere(80, 120);
+    const uint64_t expected = build(mesh.soup(), {Quality::kBalanced, 1}).report.checksum;
+    std::vector<std::thread> callers;
+    std::atomic<int> same{0};
+    for (int i = 0; i < 4; ++i) {
+        callers.emplace_back([&] { same += build(mesh.soup(), {Quality::kBalanced, 3}).report.checksum == expected ? 1 : 0; });
+    }
+    for (std::thread& caller : callers) {
+        caller.join();
+    }
+    EXPECT_EQ(same, 4);
+}
+
+}  // namespace
+}  // namespace espalier
