@@ -50,25 +50,33 @@ class _Watched:
         return {"RUNNING_MODAL"}
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        if event.type == "ESC" and event.value == "PRESS":
+        if event.type == "ESC" and event.value == "PRESS" and self.outcome is None:
             self.cancel(context)
             self.report({"INFO"}, "Cancelled: the last picture is still there")  # type: ignore[attr-defined]
             return {"CANCELLED"}
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
-        if self.session.run.done:
-            self.tidy(context)
-            return self.end(context)
-        self.tick(context)
-        return {"PASS_THROUGH"}
+        if self.outcome is None and self.session.run.done:
+            self.outcome = self.end(context)
+        elif self.outcome is None:
+            self.tick(context)
+        elif self.to_fit:
+            picture.fit(context, bpy.data.images[picture.NAME])
+            self.to_fit = False
+        if self.outcome is None or self.to_fit:  # a new editor has no size before it is drawn
+            return {"PASS_THROUGH"}
+        self.tidy(context)
+        return self.outcome
 
     def cancel(self, context: bpy.types.Context) -> None:
         """Blender calls this too, when the window closes or another file is opened."""
         self.tidy(context)
-        self.session.cancel()
-        redraw(context)
+        if self.outcome is None:
+            self.session.cancel()
 
     def begin(self, context: bpy.types.Context) -> bool:
+        self.outcome: set[str] | None = None
+        self.to_fit = False
         try:
             self.session = Session(context, self.kind)
         except Exception as error:  # whatever it is, the artist is told and nothing is lost
@@ -81,7 +89,14 @@ class _Watched:
         context.workspace.status_text_set(self.session.status)
         image = self.session.look()
         if image is not None:
-            picture.open_editor(context, image)
+            self.show(context, image)
+        for region in regions(context, "VIEW_3D", "UI"):
+            region.tag_redraw()
+
+    def show(self, context: bpy.types.Context, image: bpy.types.Image) -> None:
+        if self.to_fit:
+            picture.fit(context, image)
+        self.to_fit = picture.open_editor(context, image)
 
     def tidy(self, context: bpy.types.Context) -> None:
         _Watched.running = None
@@ -90,6 +105,7 @@ class _Watched:
         manager.progress_end()
         if context.workspace is not None:
             context.workspace.status_text_set(None)
+        redraw(context)
 
     def end(self, context: bpy.types.Context) -> set[str]:
         try:
@@ -103,7 +119,6 @@ class _Watched:
             self.report({"WARNING"}, line)  # type: ignore[attr-defined]
         if not bpy.app.background:
             self.present(context)
-            redraw(context)
         return {"FINISHED"}
 
     def present(self, context: bpy.types.Context) -> None:
@@ -119,7 +134,7 @@ class ESPALIER_OT_preview(_Watched, bpy.types.Operator):
 
     def present(self, context: bpy.types.Context) -> None:
         """Open the picture"""
-        picture.open_editor(context, bpy.data.images[picture.NAME])
+        self.show(context, bpy.data.images[picture.NAME])
 
 
 class ESPALIER_OT_compare(_Watched, bpy.types.Operator):
@@ -132,6 +147,19 @@ class ESPALIER_OT_compare(_Watched, bpy.types.Operator):
     def present(self, context: bpy.types.Context) -> None:  # noqa: ARG002
         """Show the bars"""
         overlay.switch(True)
+
+
+class ESPALIER_OT_cancel(bpy.types.Operator):
+    """Stop what Espalier is doing; the last picture stays"""
+
+    bl_idname = "espalier.cancel"
+    bl_label = "Cancel"
+
+    def execute(self, context: bpy.types.Context) -> set[str]:  # noqa: ARG002
+        """Stop it; its own operator hears of that at the next tick"""
+        if (session := at_work()) is not None:
+            session.run.cancel()
+        return {"FINISHED"}
 
 
 class ESPALIER_OT_overlay(bpy.types.Operator):
@@ -147,15 +175,30 @@ class ESPALIER_OT_overlay(bpy.types.Operator):
         return {"FINISHED"}
 
 
+def at_work() -> Session | None:
+    """The run that is being watched now."""
+    return None if _Watched.running is None else _Watched.running.session
+
+
+def regions(context: bpy.types.Context, area_type: str, region_type: str) -> list[bpy.types.Region]:
+    """The regions of that kind in all windows."""
+    return [
+        region
+        for window in context.window_manager.windows
+        for area in window.screen.areas
+        for region in area.regions
+        if (area.type, region.type) == (area_type, region_type)
+    ]
+
+
 def redraw(context: bpy.types.Context) -> None:
-    """Let the sidebar and the overlay show what has changed."""
-    for window in context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type in {"VIEW_3D", "IMAGE_EDITOR"}:
-                area.tag_redraw()
+    """Let the sidebars and the overlays show what has changed."""
+    for kind in ("UI", "WINDOW"):
+        for region in regions(context, "VIEW_3D", kind):
+            region.tag_redraw()
 
 
-classes = (ESPALIER_OT_preview, ESPALIER_OT_compare, ESPALIER_OT_overlay)
+classes = (ESPALIER_OT_preview, ESPALIER_OT_compare, ESPALIER_OT_cancel, ESPALIER_OT_overlay)
 
 
 def register() -> None:

@@ -64,22 +64,22 @@ def layout(
 ) -> list[Box | Label]:
     """Boxes and labels for the lower left corner of a region.
 
-    left: pixels taken by a toolbar; width: pixels of the whole region; scale: the interface's scale;
+    left: pixels taken by a toolbar; width: pixels up to the region's end or the sidebar; scale: the interface's scale;
     text_width(text, size) in pixels. Nothing where the region is too narrow for it.
     """
     rows = rows_of(last)
-    title = f"Espalier: {report.headline(last)}"
     margin, padding, row_height, font, gap = (scale * value for value in (MARGIN, PADDING, ROW, FONT, GAP))
     label_width = max(text_width(label, font) for label, _, _ in rows)
     note_width = max(text_width(note, font) for _, _, note in rows)
     bar_width = scale * BAR_WIDTH
-    inner = max(label_width + gap + bar_width + gap + note_width, text_width(title, font))
-    spare = width - left - 2.0 * margin - 2.0 * padding - inner
-    if spare < 0.0:
-        bar_width += spare
-        inner = label_width + gap + bar_width + gap + note_width
-    if bar_width < scale * GAP or text_width(title, font) > inner:
+    room = width - left - 2.0 * margin - 2.0 * padding
+    bar_width = min(bar_width, room - label_width - note_width - 2.0 * gap)
+    if bar_width < scale * GAP:
         return []
+    inner = label_width + gap + bar_width + gap + note_width
+    titles = (f"Espalier: {report.headline(last)}", f"Espalier: {last['triangles']:,} triangles", "Espalier")
+    title = next((text for text in titles if text_width(text, font) <= room), "")
+    inner = max(inner, text_width(title, font))
     longest = max(ms for _, ms, _ in rows) or 1.0
     x0, y0 = left + margin, margin
     x = x0 + padding
@@ -130,7 +130,9 @@ def _draw() -> None:
     if last is None or not context.space_data.overlay.show_overlays:
         return
     system = context.preferences.system
-    tools = [region.width for region in context.area.regions if region.type == "TOOLS" and system.use_region_overlap]
+    covered = dict.fromkeys(("TOOLS", "UI"), 0)
+    if system.use_region_overlap:
+        covered |= {region.type: region.width for region in context.area.regions if region.type in covered}
 
     def text_width(text: str, size: float) -> float:
         blf.size(0, size)
@@ -138,7 +140,8 @@ def _draw() -> None:
 
     shader = gpu.shader.from_builtin("UNIFORM_COLOR")
     gpu.state.blend_set("ALPHA")
-    for item in layout(last, float(sum(tools)), float(context.region.width), system.ui_scale, text_width):
+    free = float(context.region.width - covered["UI"])
+    for item in layout(last, float(covered["TOOLS"]), free, system.ui_scale, text_width):
         if isinstance(item, Label):
             blf.size(0, item.size)
             blf.color(0, *item.color)

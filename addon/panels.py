@@ -6,7 +6,7 @@ from __future__ import annotations
 import bpy
 
 from . import overlay, report
-from .operators import ESPALIER_OT_compare, ESPALIER_OT_overlay, ESPALIER_OT_preview
+from .operators import ESPALIER_OT_cancel, ESPALIER_OT_compare, ESPALIER_OT_overlay, ESPALIER_OT_preview, at_work
 from .session import COMPARE, PREVIEW, last_report
 
 
@@ -31,6 +31,10 @@ class ESPALIER_PT_preview(_Sidebar, bpy.types.Panel):
         buttons.scale_y = 1.3
         buttons.operator(ESPALIER_OT_preview.bl_idname, icon="RENDER_STILL")
         buttons.operator(ESPALIER_OT_compare.bl_idname, icon="SORTTIME")
+        if (session := at_work()) is not None:
+            row = layout.row(align=True)
+            row.progress(factor=session.run.progress, text=session.run.stage.capitalize())
+            row.operator(ESPALIER_OT_cancel.bl_idname, text="", icon="X")
         layout.prop(settings, "quality")
         layout.prop(settings, "threads")
         layout.prop(settings, "samples")

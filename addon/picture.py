@@ -80,22 +80,49 @@ def replaced(path: Path) -> Iterator[Path]:
         unfinished.unlink(missing_ok=True)
 
 
-def open_editor(context: bpy.types.Context, image: bpy.types.Image) -> None:
-    """Show the image where the artist sees it: in an image editor that is open, else in a window of its own."""
-    areas = [area for window in context.window_manager.windows for area in window.screen.areas]
-    editors = [area for area in areas if area.type == "IMAGE_EDITOR" and area.ui_type == "IMAGE_EDITOR"]
+def open_editor(context: bpy.types.Context, image: bpy.types.Image) -> bool:
+    """Show the image in an image editor that is open, else in half of the 3D viewport; whether it had to be made."""
+    editors = [area for _, area in _editors(context)]
     if any(area.spaces.active.image == image for area in editors):
-        return
+        return False
     free = [area for area in editors if not area.spaces.active.use_image_pin]
     if free:
         free[0].spaces.active.image = image
-        return
-    before = set(context.window_manager.windows)
-    bpy.ops.wm.window_new()
-    for window in set(context.window_manager.windows) - before:
-        area = window.screen.areas[0]
+        return False
+    # Not in a window of its own: that would take the keyboard, and Esc would not reach the operator.
+    screen = context.window.screen
+    areas = [area for area in screen.areas if area.type == "VIEW_3D"] or list(screen.areas)
+    widest = max(areas, key=lambda area: area.width * area.height)
+    before = set(screen.areas)
+    with context.temp_override(area=widest, region=_window_region(widest)):
+        bpy.ops.screen.area_split(direction="VERTICAL", factor=0.5)
+    made = set(screen.areas) - before
+    for area in made:
         area.ui_type = "IMAGE_EDITOR"
         area.spaces.active.image = image
+    return bool(made)
+
+
+def fit(context: bpy.types.Context, image: bpy.types.Image) -> None:
+    """Zoom the editor that shows the image so that all of it is seen; a new editor must have been drawn before."""
+    for window, area in _editors(context):
+        if area.spaces.active.image == image:
+            with context.temp_override(window=window, area=area, region=_window_region(area)):
+                bpy.ops.image.view_all(fit_view=True)
+            return
+
+
+def _editors(context: bpy.types.Context) -> list[tuple[bpy.types.Window, bpy.types.Area]]:
+    return [
+        (window, area)
+        for window in context.window_manager.windows
+        for area in window.screen.areas
+        if area.ui_type == "IMAGE_EDITOR"
+    ]
+
+
+def _window_region(area: bpy.types.Area) -> bpy.types.Region:
+    return next(region for region in area.regions if region.type == "WINDOW")
 
 
 def _new_image(name: str, width: int, height: int) -> bpy.types.Image:

@@ -69,7 +69,8 @@ def tree_lines(report: Report) -> list[str]:
     return [
         f"{tree['nodes']:,} nodes, {tree['leaves']:,} leaves ({tree['empty_leaves']:,} empty)",
         f"{per_triangle:.2f} references per triangle, {tree['bytes'] / 1e6:,.1f} MB",
-        f"SAH cost {tree['sah_cost']:.3f} ({constants})",
+        f"SAH cost {tree['sah_cost']:.3f}",
+        f"with {constants}",
         f"Checksum {tree['checksum']}",
     ]
 

@@ -103,7 +103,7 @@ def test_registering_adds_no_handler_and_unregistering_leaves_nothing(bpy: Modul
             assert during["handlers"] == before["handlers"]
             assert not addon.overlay.is_on()
             assert during["property"]
-            assert sorted(during["operators"]) == ["compare", "overlay", "preview"]
+            assert sorted(during["operators"]) == ["cancel", "compare", "overlay", "preview"]
             assert {"RENDER_PT_format", "MATERIAL_PT_viewport"} & during["panels"]
         finally:
             addon.unregister()
