@@ -82,7 +82,8 @@ HWY_INLINE void push_children(const BoxRay& ray, uint32_t octant, const WideNode
             entry = hn::Max(t_near, entry);
             exit = hn::Min(t_far, exit);
         }
-        const auto meets = hn::Le(entry, exit);
+        // Products that underflow are off by an absolute error as well.
+        const auto meets = hn::Le(entry, hn::Add(exit, hn::Set(d, 0x1p-140F)));
         if constexpr (kLanes == WideNode::kWidth && HWY_TARGET != HWY_SSE4) {
             // All eight in one register: permute by the octant's order and compress onto the stack, without a branch on their number.
             const auto ranks = hn::Shr(hn::Set(du, node.order[octant]), hn::Mul(hn::Iota(du, 0), hn::Set(du, 3)));
@@ -109,49 +110,49 @@ HWY_INLINE void push_children(const BoxRay& ray, uint32_t octant, const WideNode
 }
 
 template <bool kAnyHit>
-HWY_INLINE bool trace(const Tree& tree, const Ray& ray, Hit& hit) {
-    hit = {ray.t_max, 0, 0, -1};
+HWY_INLINE void trace(const Tree& tree, const Ray& ray, NearestHit& nearest) {
     if (tree.wide_nodes.size() == 0) {
-        return false;
+        return;
     }
     const BoxRay box_ray(ray);
-    const ShearedRay sheared(ray);
+    const ShearedRay sheared(ray.direction);
     const uint32_t octant = box_ray.octant();
     const WideNode* nodes = tree.wide_nodes.data();
     const TriangleBlock* blocks = tree.blocks.data();
     TraversalStack stack;
-    push_children(box_ray, octant, nodes[0], ray.t_min, ray.t_max, stack);
+    push_children(box_ray, octant, nodes[0], ray.t_min, nearest.reach(), stack);
     while (stack.count > 0) {
         --stack.count;
-        // The hit's t is rounded and may lie just before the box that a hit as near as it would be in.
-        if (stack.distance[stack.count] > hit.t * (1 + 0x1p-20F)) {
+        if (stack.distance[stack.count] > nearest.reach()) {
             continue;
         }
         const uint32_t child = stack.child[stack.count];
         if ((child & WideNode::kLeafFlag) == 0) {
-            push_children(box_ray, octant, nodes[child], ray.t_min, hit.t * (1 + 0x1p-20F), stack);
+            push_children(box_ray, octant, nodes[child], ray.t_min, nearest.reach(), stack);
             continue;
         }
         const TriangleBlock* block = blocks + WideNode::first_block(child);
         for (const TriangleBlock* end = block + WideNode::blocks(child); block != end; ++block) {
-            if (test_block<kAnyHit>(sheared, *block, hit) && kAnyHit) {
-                return true;
+            if (test_block<kAnyHit>(ray, sheared, *block, nearest) && kAnyHit) {
+                return;
             }
         }
     }
-    return hit.triangle >= 0;
 }
 
 void intersect(const Tree& tree, std::span<const Ray> rays, std::span<Hit> hits) {
     for (size_t i = 0; i < rays.size(); ++i) {
-        trace<false>(tree, rays[i], hits[i]);
+        NearestHit nearest(rays[i]);
+        trace<false>(tree, rays[i], nearest);
+        hits[i] = nearest.result();
     }
 }
 
 void occluded(const Tree& tree, std::span<const Ray> rays, std::span<uint8_t> results) {
     for (size_t i = 0; i < rays.size(); ++i) {
-        Hit hit;
-        results[i] = trace<true>(tree, rays[i], hit) ? 1 : 0;
+        NearestHit nearest(rays[i]);
+        trace<true>(tree, rays[i], nearest);
+        results[i] = nearest.found() ? 1 : 0;
     }
 }
 

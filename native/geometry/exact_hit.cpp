@@ -1,0 +1,140 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+#include "geometry/exact_hit.h"
+
+#include "geometry/expansion.h"
+
+namespace espalier {
+namespace {
+
+using ExactVec = Vec3<Expansion>;
+
+ExactVec exact_difference(Vec3f a, Vec3f b) {
+    return {Expansion::difference(a.x, b.x), Expansion::difference(a.y, b.y), Expansion::difference(a.z, b.z)};
+}
+
+ExactVec exact(Vec3f a) {
+    return {Expansion(a.x), Expansion(a.y), Expansion(a.z)};
+}
+
+Expansion exact_dot(const ExactVec& a, const ExactVec& b) {
+    return a.x * b.x + a.y * b.y + a.z * b.z;
+}
+
+ExactVec exact_cross(const ExactVec& a, const ExactVec& b) {
+    return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+}
+
+/// A distance as a quotient: t = above / below, below > 0.
+struct Quotient {
+    Expansion above;
+    Expansion below;
+};
+
+Quotient exact_distance(Vec3f origin, Vec3f direction, const Vec3f (&corner)[3]) {
+    const ExactVec normal = exact_cross(exact_difference(corner[1], corner[0]), exact_difference(corner[2], corner[0]));
+    const Expansion above = exact_dot(exact_difference(corner[0], origin), normal);
+    const Expansion below = exact_dot(exact(direction), normal);
+    return below.sign() < 0 ? Quotient{Expansion() - above, Expansion() - below} : Quotient{above, below};
+}
+
+/// Six times the signed volume of direction, p and q: on which side of the edge p-q the line passes.
+struct Side {
+    double value;
+    double error;
+};
+
+/// Each difference from the origin carries a relative error e = 2^-53, each product one more, each sum one more: below 8 e times the sum of
+/// the terms' absolute values, of which 16 e is taken.
+Side measure_side(Vec3d d, Vec3d p, Vec3d q) {
+    const Vec3d c{p.y * q.z - p.z * q.y, p.z * q.x - p.x * q.z, p.x * q.y - p.y * q.x};
+    const double size = std::abs(d.x) * (std::abs(p.y * q.z) + std::abs(p.z * q.y)) +
+                        std::abs(d.y) * (std::abs(p.z * q.x) + std::abs(p.x * q.z)) +
+                        std::abs(d.z) * (std::abs(p.x * q.y) + std::abs(p.y * q.x));
+    return {d.x * c.x + d.y * c.y + d.z * c.z, size * 0x1p-49};
+}
+
+Side measure_side_exactly(Vec3f origin, Vec3f direction, Vec3f p, Vec3f q) {
+    const Expansion side =
+        exact_dot(exact(direction), exact_cross(exact_difference(p, origin), exact_difference(q, origin)));
+    const double value = side.estimate();
+    return {value, std::abs(value) * 0x1p-51};
+}
+
+int largest_component(Vec3f d) {
+    const Vec3f a{std::abs(d.x), std::abs(d.y), std::abs(d.z)};
+    return a.x > a.y ? (a.x > a.z ? 0 : 2) : (a.y > a.z ? 1 : 2);
+}
+
+}  // namespace
+
+bool hit_exactly(Vec3f origin, Vec3f direction, const Vec3f (&corner)[3], ExactHit& hit) {
+    const Vec3d d = to_double(direction);
+    Vec3d p[3];
+    for (int k = 0; k < 3; ++k) {
+        p[k] = to_double(corner[k]) - to_double(origin);
+    }
+    // side[k] belongs to the edge opposite corner k, and is that corner's weight.
+    Side side[3];
+    for (int k = 0; k < 3; ++k) {
+        side[k] = measure_side(d, p[(k + 1) % 3], p[(k + 2) % 3]);
+    }
+    const auto add_up = [&](double& det, double& error) {
+        det = side[0].value + side[1].value + side[2].value;
+        error = side[0].error + side[1].error + side[2].error;
+    };
+    double det;
+    double error;
+    add_up(det, error);
+    const auto is_open = [](const Side& s) { return std::abs(s.value) <= s.error; };
+    if (is_open(side[0]) || is_open(side[1]) || is_open(side[2]) || std::abs(det) < error * 0x1p28) {
+        for (int k = 0; k < 3; ++k) {
+            side[k] = measure_side_exactly(origin, direction, corner[(k + 1) % 3], corner[(k + 2) % 3]);
+        }
+        add_up(det, error);
+    }
+    const bool any_positive = side[0].value > 0 || side[1].value > 0 || side[2].value > 0;
+    const bool any_negative = side[0].value < 0 || side[1].value < 0 || side[2].value < 0;
+    if (any_positive == any_negative) {  // on both sides, or in the plane
+        return false;
+    }
+    hit.u = side[1].value / det;
+    hit.v = side[2].value / det;
+    for (int k = 0; k < 3; ++k) {
+        hit.corner[k] = corner[k];
+    }
+    // The weighted mean of the corners along the direction's largest axis. The weights' errors count by the corners' spread.
+    const int axis = largest_component(direction);
+    const double z[3] = {p[0][axis], p[1][axis], p[2][axis]};
+    const double spread = std::max({z[0], z[1], z[2]}) - std::min({z[0], z[1], z[2]});
+    const double size = std::max({std::abs(z[0]), std::abs(z[1]), std::abs(z[2])});
+    const double mean = (side[0].value * z[0] + side[1].value * z[1] + side[2].value * z[2]) / det;
+    const double reach = std::abs(d[axis]);
+    hit.t = mean / d[axis];
+    hit.error = (error * spread / (std::abs(det) - error) + 0x1p-49 * size) / reach;
+    if (!(hit.error <= std::abs(hit.t) * 0x1p-28)) {  // too close to the origin for its distance to be sure
+        const Quotient distance = exact_distance(origin, direction, corner);
+        hit.t = distance.above.estimate() / distance.below.estimate();
+        hit.error = std::abs(hit.t) * 0x1p-50;
+    }
+    return true;
+}
+
+int compare_distance(Vec3f origin, Vec3f direction, const ExactHit& a, const ExactHit& b) {
+    const double margin = 1.0 + 0x1p-50;  // for the rounding of this comparison itself
+    if (std::abs(a.t - b.t) > (a.error + b.error) * margin) {
+        return a.t < b.t ? -1 : 1;
+    }
+    const Quotient x = exact_distance(origin, direction, a.corner);
+    const Quotient y = exact_distance(origin, direction, b.corner);
+    return (x.above * y.below - y.above * x.below).sign();
+}
+
+int compare_distance(Vec3f origin, Vec3f direction, const ExactHit& hit, float t) {
+    if (std::abs(hit.t - t) > hit.error * (1.0 + 0x1p-50)) {
+        return hit.t < t ? -1 : 1;
+    }
+    const Quotient x = exact_distance(origin, direction, hit.corner);
+    return (x.above - Expansion(t) * x.below).sign();
+}
+
+}  // namespace espalier

@@ -1,0 +1,154 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+#include <gtest/gtest.h>
+
+#include "kdtree/traversal.h"
+#include "meshes.h"
+
+namespace espalier {
+namespace {
+
+/// The same triangles in one leaf: every ray tests them all, and nothing but the triangle test decides.
+Tree make_flat_list(const Mesh& mesh) {
+    Tree tree = build(mesh.soup(), {Quality::kBalanced, 1});
+    const uint32_t count = mesh.soup().size();
+    tree.blocks = LargeBuffer<TriangleBlock>(block_count(count));
+    for (uint32_t i = 0; i < block_count(count) * kBlockSize; ++i) {
+        TriangleBlock& block = tree.blocks[i / kBlockSize];
+        block.triangle[i % kBlockSize] = i < count ? i : kNoTriangle;
+        for (int corner = 0; corner < 3; ++corner) {
+            for (int axis = 0; axis < 3; ++axis) {
+                block.vertex[corner][axis][i % kBlockSize] = i < count ? mesh.soup().vertex(i, corner)[axis] : NAN;
+            }
+        }
+    }
+    const uint32_t leaves = (block_count(count) + WideNode::kMaxLeafBlocks - 1) / WideNode::kMaxLeafBlocks;
+    tree.wide_nodes = LargeBuffer<WideNode>((leaves + WideNode::kWidth - 2) / (WideNode::kWidth - 1));
+    uint32_t first = 0;
+    for (uint32_t n = 0; n < tree.wide_nodes.size(); ++n) {
+        WideNode& node = tree.wide_nodes[n];
+        const bool has_next = n + 1 < tree.wide_nodes.size();
+        for (int i = 0; i < WideNode::kWidth; ++i) {
+            const bool is_link = i == WideNode::kWidth - 1 && has_next;
+            const uint32_t blocks = is_link ? 0 : std::min(WideNode::kMaxLeafBlocks, block_count(count) - first);
+            const bool used = is_link || blocks != 0;
+            for (int axis = 0; axis < 3; ++axis) {
+                node.lower[axis][i] = used ? -1e20F : INFINITY;
+                node.upper[axis][i] = used ? 1e20F : -INFINITY;
+            }
+            if (used) {
+                node.child[i] = is_link ? n + 1 : WideNode::leaf(first, blocks);
+            }
+            first += blocks;
+        }
+        std::fill(node.order, node.order + 8, 076543210U);
+    }
+    return tree;
+}
+
+std::vector<Ray> make_rays(const Mesh& mesh, uint32_t count, uint32_t seed) {
+    std::mt19937 random(seed);
+    const auto uniform = [&] { return static_cast<float>(random() >> 8) * 0x1p-24F; };
+    const Box3f box = build(mesh.soup(), {Quality::kDraft, 1}).bounds;
+    const auto point = [&] { return box.lower + box.size() * Vec3f{uniform() * 2 - 0.5F, uniform() * 2 - 0.5F, uniform() * 2 - 0.5F}; };
+    const auto vertex = [&] {
+        const float* p = &mesh.positions[size_t{3} * (random() % (mesh.positions.size() / 3))];
+        return Vec3f{p[0], p[1], p[2]};
+    };
+    std::vector<Ray> rays;
+    for (uint32_t i = 0; i < count; ++i) {
+        const Vec3f from = point();
+        const Vec3f axis = (i & 4U) != 0 ? Vec3f{1, 0, 0} : (i & 8U) != 0 ? Vec3f{0, -1, 0} : Vec3f{-0.0F, 0, 1};
+        switch (i % 4) {
+            case 0: rays.push_back({from, 0, point() - from, INFINITY}); break;
+            case 1: rays.push_back({from, 0, vertex() - from, INFINITY}); break;                     // at a vertex
+            case 2: rays.push_back({vertex() - axis * (2 * box.size().x), 0, axis, INFINITY}); break;  // along an axis through a vertex
+            default: rays.push_back({from, 0, (vertex() + vertex()) * 0.5F - from, INFINITY}); break;
+        }
+    }
+    return rays;
+}
+
+/// Whatever the tree, a ray hits what it would hit if every triangle were tested, bit for bit.
+TEST(Traversal, LosesNoHit) {
+    Mesh far = make_sphere(24, 32);
+    for (float& x : far.positions) {
+        x += 1e5F;
+    }
+    const Mesh meshes[] = {make_sphere(24, 32), make_soup(1500, 11), make_furball(300), make_grid(20), far};
+    for (const Mesh& mesh : meshes) {
+        const Tree list = make_flat_list(mesh);
+        const std::vector<Ray> rays = make_rays(mesh, 3000, 12);
+        std::vector<Hit> expected(rays.size());
+        intersect(list, rays, expected);
+        for (const Quality quality : {Quality::kDraft, Quality::kBalanced, Quality::kBest}) {
+            const Tree tree = build(mesh.soup(), {quality, 1});
+            std::vector<Hit> hits(rays.size());
+            std::vector<uint8_t> blocked(rays.size());
+            intersect(tree, rays, hits);
+            occluded(tree, rays, blocked);
+            uint32_t different = 0;
+            uint32_t contradicted = 0;
+            for (size_t i = 0; i < rays.size(); ++i) {
+                different += hits[i].triangle != expected[i].triangle || hits[i].t != expected[i].t ? 1U : 0U;
+                contradicted += (hits[i].triangle >= 0) != (blocked[i] != 0) ? 1U : 0U;
+            }
+            EXPECT_EQ(different, 0U);
+            EXPECT_EQ(contradicted, 0U);
+        }
+    }
+}
+
+TEST(Traversal, KeepsToTheRaysInterval) {
+    Mesh mesh;
+    mesh.add_triangle({-1, -1, 1}, {2, -1, 1}, {-1, 2, 1});
+    mesh.add_triangle({-1, -1, 2}, {2, -1, 2}, {-1, 2, 2});
+    const Tree tree = build(mesh.soup(), {});
+    const struct {
+        float t_min, t_max;
+        int triangle;
+    } cases[] = {{0, INFINITY, 0}, {1, 1, 0}, {1.5F, INFINITY, 1}, {1.5F, 2, 1}, {1.25F, 1.75F, -1}, {2.5F, INFINITY, -1}, {0, 0.5F, -1}};
+    for (const auto& c : cases) {
+        const Ray ray{{0, 0, 0}, c.t_min, {0, 0, 1}, c.t_max};
+        Hit hit{};
+        uint8_t blocked = 0;
+        intersect(tree, {&ray, 1}, {&hit, 1});
+        occluded(tree, {&ray, 1}, {&blocked, 1});
+        EXPECT_EQ(hit.triangle, c.triangle);
+        EXPECT_EQ(blocked != 0, c.triangle >= 0);
+        EXPECT_EQ(hit.t, c.triangle < 0 ? c.t_max : static_cast<float>(c.triangle + 1));
+    }
+}
+
+TEST(Traversal, ClosedMeshIsWatertight) {
+    const Mesh mesh = make_sphere(48, 64);
+    const Tree tree = build(mesh.soup(), {});
+    std::vector<Ray> rays;
+    for (size_t i = 0; i < mesh.positions.size(); i += 3) {
+        const Vec3f corner{mesh.positions[i], mesh.positions[i + 1], mesh.positions[i + 2]};
+        rays.push_back({{0.01F, 0.02F, -0.03F}, 0, corner - Vec3f{0.01F, 0.02F, -0.03F}, INFINITY});
+    }
+    for (uint32_t i = 0; i < mesh.soup().size(); ++i) {
+        const Vec3f middle = (mesh.soup().vertex(i, 0) + mesh.soup().vertex(i, 1)) * 0.5F;
+        rays.push_back({{}, 0, middle, INFINITY});
+    }
+    std::vector<Hit> hits(rays.size());
+    intersect(tree, rays, hits);
+    EXPECT_EQ(std::count_if(hits.begin(), hits.end(), [](const Hit& hit) { return hit.triangle < 0; }), 0);
+}
+
+TEST(Traversal, BarycentricsNameTheCorners) {
+    Mesh mesh;
+    mesh.add_triangle({0, 0, 0}, {4, 0, 0}, {0, 4, 0});
+    const Tree tree = build(mesh.soup(), {});
+    for (const float sign : {1.0F, -1.0F}) {
+        const Ray ray{{1, 2, -3 * sign}, 0, {0, 0, sign}, INFINITY};
+        Hit hit{};
+        intersect(tree, {&ray, 1}, {&hit, 1});
+        EXPECT_FLOAT_EQ(hit.t, 3);
+        EXPECT_FLOAT_EQ(hit.u, 0.25F);
+        EXPECT_FLOAT_EQ(hit.v, 0.5F);
+    }
+}
+
+}  // namespace
+}  // namespace espalier
