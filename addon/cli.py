@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`blender -b FILE -c espalier preview …`, or `python -m addon.cli preview SCENE …` with pip's bpy"""
+"""`blender -b FILE -c espalier preview …`, or `python -m addon preview SCENE …` with pip's bpy"""
 
 from __future__ import annotations
 
@@ -204,7 +204,3 @@ def _say(line: str) -> None:
 def _fail(reason: str) -> int:
     _say(f"error: {reason}")
     return FAILURE
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

@@ -19,6 +19,11 @@ class _Watched:
     kind: ClassVar[str]
     running: ClassVar[_Watched | None] = None  # one at a time, for the cores are shared
 
+    session: Session
+    timer: bpy.types.Timer
+    outcome: set[str] | None  # None: still at work
+    to_fit: bool  # an image editor was made, and has no size before it is drawn
+
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         if _Watched.running is not None:
@@ -63,7 +68,7 @@ class _Watched:
         elif self.to_fit:
             picture.fit(context, bpy.data.images[picture.NAME])
             self.to_fit = False
-        if self.outcome is None or self.to_fit:  # a new editor has no size before it is drawn
+        if self.outcome is None or self.to_fit:
             return {"PASS_THROUGH"}
         self.tidy(context)
         return self.outcome
@@ -75,7 +80,7 @@ class _Watched:
             self.session.cancel()
 
     def begin(self, context: bpy.types.Context) -> bool:
-        self.outcome: set[str] | None = None
+        self.outcome = None
         self.to_fit = False
         try:
             self.session = Session(context, self.kind)

@@ -17,7 +17,7 @@ SMALL = ["--percentage", "2", "--samples", "1"]
 
 
 def espalier(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "addon.cli", *map(str, arguments)]
+    command = [sys.executable, "-m", "addon", *map(str, arguments)]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
 
 
