@@ -93,15 +93,16 @@ def plant(
     tree: bpy.types.Mesh, colours: list[str], spots: np.ndarray, sizes: np.ndarray, random: np.random.Generator
 ) -> None:
     """Instances of a tree on the faces of a mesh: one small square per spot, whose size and turn are the tree's."""
-    angle = random.uniform(0, 2 * np.pi, (len(spots), 1)) + np.arange(4) * np.pi / 2
+    # The viewport, unlike a render, also shows the tree that is copied, so it stands on the first of the spots itself.
+    offsets, sizes = spots[1:] - spots[0], sizes[1:]
+    angle = random.uniform(0, 2 * np.pi, (len(offsets), 1)) + np.arange(4) * np.pi / 2
     reach = (
         np.sqrt(0.5) * sizes[:, None]
     )  # a square of side `size`: its face scales the instance by the root of its area
     corner = np.stack([reach * np.cos(angle), reach * np.sin(angle), np.zeros_like(angle)], axis=-1)
-    bed = mesh(
-        f"{tree.name} bed", (spots[:, None, :] + corner).reshape(-1, 3), np.arange(4 * len(spots)).reshape(-1, 4)
-    )
-    parent = place(bed, colours[0])
+    squares = (offsets[:, None, :] + corner).reshape(-1, 3)
+    bed = mesh(f"{tree.name} bed", squares, np.arange(4 * len(offsets)).reshape(-1, 4))
+    parent = place(bed, colours[0], spots[0])
     parent.instance_type, parent.use_instance_faces_scale = "FACES", True
     parent.show_instancer_for_viewport = parent.show_instancer_for_render = False
     place(tree, colours).parent = parent

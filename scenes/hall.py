@@ -157,9 +157,8 @@ def stadium() -> None:
         ("upper stand", 27.0, 20, 11.5, 0.85, 0.48),
     ]:
         row = np.arange(rows)
-        offset = np.repeat(np.append(first + step * row, first + step * rows), 2)
-        level = np.repeat(base + lift * row, 2)
-        level = np.concatenate([[0.0 if base < 5 else base - 2.5], level, [level[-1]]])
+        offset = np.repeat(np.append(first + step * row, first + step * rows), 2)[:-1]
+        level = np.append(0.0 if base < 5 else base - 2.5, np.repeat(base + lift * row, 2))
         x, y = oval(offset, segments)
         steps = sheet(
             name, np.stack([x, y, np.broadcast_to(level[:, None], x.shape)], axis=-1), closed_columns=True, smooth=False
@@ -218,7 +217,7 @@ def build() -> None:
         (0.385, 1.1),
         (0, 1.1),
     ]
-    place(lathe("drum", drum, 128), "#e0d3bd")
+    place(lathe("drum", drum, 128, 10), "#e0d3bd")
     teapot()
     camera((-0.473, -0.619, TABLE + 0.13), (0.019, -0.023, TABLE + 0.143), 25)
 

@@ -268,5 +268,6 @@ def main(build: Callable[[], None]) -> None:
     if len(sys.argv) != 2:
         sys.exit(f"usage: python {sys.argv[0]} OUT.blend")
     bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.context.scene.name = Path(sys.argv[0]).stem
     build()
     save(sys.argv[1])

@@ -76,9 +76,11 @@ def build() -> None:
 
     light("AREA", "#ffe6c8", 760, (-4.2, -2.6, 5.0), (0, 0, 1.9), shape="DISK", size=1.0)  # the key
     light(
-        "AREA", "#8fb4ff", 130, (3.6, -5.5, 2.6), (0, 0, 1.7), shape="RECTANGLE", size=4, size_y=4
+        "AREA", "#8fb4ff", 300, (5.5, -9.0, 3.4), (0, 0, 1.7), shape="RECTANGLE", size=4, size_y=4
     )  # what the room would throw back
-    light("AREA", "#ffae70", 80, (2.4, 2.0, 4.2), (0, 0, 1.9), shape="DISK", size=0.8)  # a rim against the backdrop
+    light(
+        "SPOT", "#ffae70", 900, (2.4, 2.0, 4.2), (0, 0, 1.9), spot_size=0.75, spot_blend=0.6, shadow_soft_size=0.3
+    )  # a rim
     camera((0.3, -7.2, 1.95), (0, 0, 1.62), 58)
 
 
