@@ -147,7 +147,11 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--output", required=True, type=_png, metavar="PNG", help="the picture to write")
     command.add_argument("--json", type=Path, metavar="JSON", help="write the timings here")
     command.add_argument(
-        "--threads", type=_counts, default=[], metavar="N,N…", help="thread counts to compare; default: 1, 2, 4 … all"
+        "--threads",
+        type=_counts,
+        default=[],
+        metavar="N,N…",
+        help="thread counts to compare, the last one draws; default: 1, 2, 4 … all",
     )
     command.add_argument("--quality", choices=("draft", "balanced", "best"), default="balanced")
     command.add_argument("--samples", type=_number(1, 4096), default=4, metavar="N", help="rays per pixel; default: 4")

@@ -57,7 +57,9 @@ class _Results(_Sidebar):
         if last is None:
             return
         layout = self.layout  # type: ignore[attr-defined]
-        layout.label(text=report.headline(last))
+        column = layout.column(align=True)
+        column.label(text=report.size_line(last))
+        column.label(text=report.settings_line(last).capitalize())
         self.draw_times(layout, last)
         column = layout.column(align=True)
         for line in report.tree_lines(last):

@@ -12,7 +12,7 @@ Report = dict[str, Any]
 
 # What is wrong with faces that are not in the tree: one of them, several of them.
 FAULTS = {
-    "not_finite": ("has a vertex that is not finite", "have a vertex that is not finite"),
+    "not_finite": ("is not finite", "are not finite"),
     "no_area": ("has no area", "have no area"),
     "too_large": ("is too large", "are too large"),
 }
@@ -58,19 +58,29 @@ def thread_lines(report: Report) -> list[tuple[str, float, str]]:
 
 def headline(report: Report) -> str:
     """What was measured, in a few words."""
-    return f"{report['triangles']:,} triangles, {report['quality']}, {report['settings_used']} settings"
+    return f"{size_line(report)}, {settings_line(report)}"
+
+
+def size_line(report: Report) -> str:
+    """How many triangles were built, and how."""
+    return f"{report['triangles']:,} triangles, {report['quality']}"
+
+
+def settings_line(report: Report) -> str:
+    """Whose levels of modifiers and whose visibility were used: the viewport's or the render's."""
+    return f"{report['settings_used']} settings"
 
 
 def tree_lines(report: Report) -> list[str]:
     """The size and the quality of the tree, as short lines."""
     tree = report.get("build") or report["serial"]
     per_triangle = tree["references"] / tree["triangles"] if tree["triangles"] else 0.0
-    constants = ", ".join(f"{name} {value:g}" for name, value in tree["sah_constants"].items())
+    constants = [f"{name.replace('_', ' ')} {value:g}" for name, value in tree["sah_constants"].items()]
     return [
         f"{tree['nodes']:,} nodes, {tree['leaves']:,} leaves ({tree['empty_leaves']:,} empty)",
         f"{per_triangle:.2f} references per triangle, {tree['bytes'] / 1e6:,.1f} MB",
         f"SAH cost {tree['sah_cost']:.3f}",
-        f"with {constants}",
+        *(f"with {', '.join(constants[i : i + 2])}" for i in range(0, len(constants), 2)),
         f"Checksum {tree['checksum']}",
     ]
 
