@@ -38,6 +38,11 @@ Vec3d load(std::span<const float> xyz, size_t index) {
     return {xyz[3 * index], xyz[3 * index + 1], xyz[3 * index + 2]};
 }
 
+/// Whether a vertex may have a say in where the scene's centre is: one stray coordinate must not spoil all others.
+bool in_reach(Vec3d p) {
+    return std::abs(p.x) <= kMaxCoordinate && std::abs(p.y) <= kMaxCoordinate && std::abs(p.z) <= kMaxCoordinate;
+}
+
 struct Bounds {
     Vec3d lower{HUGE_VAL, HUGE_VAL, HUGE_VAL};
     Vec3d upper{-HUGE_VAL, -HUGE_VAL, -HUGE_VAL};
@@ -143,7 +148,7 @@ void Scene::place(std::span<const MeshInput> meshes, std::span<const Placement> 
         Bounds bounds;
         for (size_t i = chunk.begin; i < chunk.end; ++i) {
             const Vec3d p = placement.matrix.point(load(meshes[placement.mesh].positions, i));
-            if (is_finite(p))
+            if (in_reach(p))
                 bounds.add({p, p});
         }
         chunk_bounds[c] = bounds;

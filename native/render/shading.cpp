@@ -23,9 +23,9 @@ Ray shadow_ray(const SurfacePoint& surface, const LightSample& sample) {
     if (sample.distant)
         return {start, 0.0F, to_float(sample.to_light), std::numeric_limits<float>::infinity()};
 
-    // The end is drawn back by its own rounding error, so that a lamp lying in a surface is not hidden by that surface.
+    // The end is drawn back by more than the error of a hit, so that a lamp in a surface is not hidden by that surface.
     const Vec3d end = surface.position + sample.to_light;
-    const double end_error = (largest(end) + largest(lifted)) * 0x1p-22 / length(sample.to_light);
+    const double end_error = (largest(end) + largest(lifted)) * 0x1p-20 / length(sample.to_light);
     return {start, 0.0F, to_float(end - to_double(start)), static_cast<float>(std::max(0.0, 1.0 - end_error))};
 }
 
