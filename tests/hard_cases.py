@@ -183,7 +183,7 @@ def near_degenerate(rng: Generator, count: int) -> Case:
 
 
 def subnormal(rng: Generator, count: int) -> Case:
-    """Coordinates of a few hundred times the smallest float: flushing them to zero, or a product that underflows, loses all."""
+    """Coordinates of a few hundred times the smallest float: flushing to zero, or underflow of a product, loses all."""
     vertices, triangles = sphere(6, 8)
     tiny = 2.0**-149
     grid = np.round(vertices.astype(np.float64) * 300) * tiny

@@ -20,7 +20,7 @@ RAYS = 300
 
 
 def make(name: str, rays: int = RAYS) -> Case:
-    """The case without the few rays that the module refuses: a direction's largest component lies in [2^-100, 2^100]."""
+    """The case without the few rays that the module refuses: directions below 2^-100 or above 2^100."""
     vertices, triangles, origins, directions = CASES[name](np.random.default_rng(zlib.crc32(name.encode())), rays)
     largest = np.abs(directions).max(axis=1)
     taken = (largest >= 2.0**-100) & (largest <= 2.0**100)
@@ -36,7 +36,9 @@ def test_hits_are_exact(name: str) -> None:
     for quality in QUALITIES:
         tree = espalier_native.build(vertices, triangles, quality)
         hits = tree.intersect(origins, directions)
-        lost, invented, wrong = [], [], []
+        lost: list[int] = []
+        invented: list[int] = []
+        wrong: list[int] = []
         for i, verdict in enumerate(verdicts):
             found = int(hits["triangle"][i])
             if found != verdict.triangle:
