@@ -265,6 +265,13 @@ def test_the_arrays_outlive_the_next_evaluation(stage: Stage) -> None:
     assert len(world_triangles(stage.export())) == 4 * len(before)
     np.testing.assert_array_equal(world_triangles(arrays), before)
 
+    cube.data.polygons[0].use_smooth = True
+    for mesh in stage.export().meshes:
+        for array in (mesh.positions, mesh.triangles, mesh.normals):
+            while array.base is not None:
+                array = array.base  # noqa: PLW2901
+            assert isinstance(array, np.ndarray), "it lies in Blender's memory"
+
 
 def test_the_documented_reading_gives_the_same_arrays(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     from addon.export import _CornerPointer
@@ -357,6 +364,11 @@ def test_base_colours(stage: Stage) -> None:
     assert base_color(mixed) == pytest.approx((0.9, 0.8, 0.7))
     assert base_color(None) == (0.8, 0.8, 0.8)
 
+    other = tree.nodes.new("ShaderNodeOutputMaterial")
+    tree.links.new(unused.outputs[0], other.inputs["Surface"])
+    other.is_active_output = True
+    assert base_color(mixed) == pytest.approx((1.0, 1.0, 1.0))
+
 
 def test_faces_with_a_vertex_that_is_not_finite_are_named_and_left_out(stage: Stage) -> None:
     grid = [(float(x), float(y), 0.0) for y in range(4) for x in range(4)]
@@ -367,6 +379,9 @@ def test_faces_with_a_vertex_that_is_not_finite_are_named_and_left_out(stage: St
     broken.data.polygons[4].use_smooth = False
     broken.data.update()
     stage.add("Terrain again", broken.data, location=(10, 0, 0))
+    often = collection_of(stage, "Often", stage.add("Instanced", broken.data))
+    for x in (20, 30):
+        stage.add(f"Instancer {x}", None, instance_type="COLLECTION", instance_collection=often, location=(x, 0, 0))
     lost = stage.cube("Lost")
     lost.location.x = nan
     stage.cube("Sound")
@@ -374,8 +389,13 @@ def test_faces_with_a_vertex_that_is_not_finite_are_named_and_left_out(stage: St
     broken.data.calc_loop_triangles()
     touched = sum(bool({0, 15} & set(triangle.vertices)) for triangle in broken.data.loop_triangles)
     assert touched
-    assert arrays.not_finite == {"Terrain": touched, "Terrain again": touched, "Lost": 12}
-    assert triangles_of(arrays) == {"Terrain": 18 - touched, "Terrain again": 18 - touched, "Sound": 12}
+    assert arrays.not_finite == {"Terrain": touched, "Terrain again": touched, "Instanced": 2 * touched, "Lost": 12}
+    assert triangles_of(arrays) == {
+        "Terrain": 18 - touched,
+        "Terrain again": 18 - touched,
+        "Instanced": 2 * (18 - touched),
+        "Sound": 12,
+    }
     assert np.isfinite(world_triangles(arrays)).all()
     for mesh in arrays.meshes:
         assert mesh.normals is None or np.isfinite(mesh.normals).all()

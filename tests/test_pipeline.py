@@ -167,7 +167,8 @@ def test_cancel_is_quick_and_says_so(cube: Stage) -> None:
         run.result()
 
 
-def test_a_watched_run_keeps_picture_and_report(addon: ModuleType, cube: Stage) -> None:
+@pytest.mark.parametrize("way", ["Esc", "Cancel button"])
+def test_a_watched_run_keeps_picture_and_report(addon: ModuleType, cube: Stage, way: str) -> None:
     from addon import picture
     from addon.session import PREVIEW, Session, last_report
 
@@ -188,7 +189,13 @@ def test_a_watched_run_keeps_picture_and_report(addon: ModuleType, cube: Stage) 
     while session.look() is None and time.monotonic() < end:
         time.sleep(0.05)
     assert tuple(shown.size) == (640, 480)  # the new picture was growing
-    session.cancel()
+    if way == "Esc":
+        session.cancel()
+    else:
+        session.run.cancel()
+        assert session.run.wait(5.0)
+        with pytest.raises(addon.session.pipeline.Cancelled):
+            session.finish()
     assert tuple(shown.size) == (64, 48)
     np.testing.assert_array_equal(remembered(), good)
     assert last_report(cube.scene, PREVIEW) is report
