@@ -12,6 +12,7 @@
 #include <hwy/highway.h>
 
 #include "kdtree/build_kernels.h"
+#include "kdtree/sah-inl.h"
 
 HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
@@ -34,8 +35,11 @@ inline float slice_position(float lower, float upper, int j, int slices) {
     if (j == 0) {
         return lower;
     }
-    return j == slices ? upper : lower + (upper - lower) * (static_cast<float>(j) / static_cast<float>(slices));
+    return j == slices ? upper : lower + (upper - lower) * (static_cast<float>(j) * (1.0F / static_cast<float>(slices)));
 }
+
+/// A count that no node reaches, small enough for signed comparison.
+constexpr uint64_t kMostReferences = 0x7ffffffe;
 
 /// References quantised to slices, a byte each: how many planes they begin and end behind.
 constexpr uint32_t kQuantisedChunk = 1024;
@@ -111,70 +115,57 @@ inline void count_bins(const References& references, uint32_t count, const Box3f
     }
 }
 
-/// Expected blocks of a node that is split further: whole blocks where it will soon be a leaf.
-HWY_INLINE float expected_blocks(uint32_t count) {
-    return count <= kSmallNode ? static_cast<float>(block_count(count)) : static_cast<float>(count) * (1.0F / kBlockSize);
+/// Expected blocks of nodes that are split further: whole blocks where they will soon be leaves.
+template <class D, class DU = hn::RebindToUnsigned<D>>
+HWY_INLINE hn::Vec<D> expected_blocks(D d, hn::Vec<DU> counts) {
+    const hn::RebindToSigned<D> di;
+    const auto whole = hn::ShiftRight<3>(hn::Add(counts, hn::Set(DU(), kBlockSize - 1)));
+    const auto exact = hn::ConvertTo(d, hn::BitCast(di, whole));
+    const auto fraction = hn::Mul(hn::ConvertTo(d, hn::BitCast(di, counts)), hn::Set(d, 1.0F / kBlockSize));
+    const auto is_small = hn::Lt(hn::BitCast(di, counts), hn::Set(di, static_cast<int32_t>(kSmallNode + 1)));
+    return hn::IfThenElse(hn::RebindMask(d, is_small), exact, fraction);
 }
 
-/// A node's shape in units of its longest side, so that areas neither overflow nor vanish.
-struct CellShape {
-    float scale;        ///< 1 / longest side
-    float inverse_area;
-    float side[3];
-
-    explicit CellShape(const Box3f& cell) {
-        const Vec3f size = cell.size();
-        scale = 1.0F / std::max({size.x, size.y, size.z});
-        for (int axis = 0; axis < 3; ++axis) {
-            side[axis] = size[axis] * scale;
-        }
-        inverse_area = 1.0F / (side[0] * side[1] + side[1] * side[2] + side[2] * side[0]);
-    }
-    bool is_splittable() const { return scale < 0x1p100F; }
-    /// Area of the part with this extent along the axis, relative to the whole.
-    float relative_area(int axis, float extent) const {
-        const float b = side[(axis + 1) % 3];
-        const float c = side[(axis + 2) % 3];
-        return (b * c + extent * scale * (b + c)) * inverse_area;
-    }
-};
-
-inline Split choose_split(const OpenNode& node, const BinCounts& counts, const BuildParameters& parameters) {
+inline Split choose_split(const OpenNode& node, BinCounts& counts, const BuildParameters& parameters) {
+    const hn::ScalableTag<float> d;
+    const hn::RebindToUnsigned<decltype(d)> du;
+    const hn::RebindToSigned<decltype(d)> di;
     const CellShape shape(node.cell);
-    Split best;
     if (node.depth >= parameters.sah.max_depth || !shape.is_splittable()) {
-        return best;
+        return {};
     }
-    const auto traversal = static_cast<float>(parameters.sah.traversal);
-    const auto block = static_cast<float>(parameters.sah.block);
-    const auto bonus = static_cast<float>(parameters.sah.empty_bonus);
-    float best_cost = block * expected_blocks(node.count);
+    const int bins = parameters.bins;
+    const SplitCosts costs(d, node, shape, parameters.sah);
+    const auto too_many = hn::Set(di, static_cast<int32_t>(std::min<uint64_t>(node.count + node.spare, kMostReferences) + 1));
+    CheapestPlane cheapest(d);
     for (int axis = 0; axis < 3; ++axis) {
         const float lower = node.tight.lower[axis];
         const float upper = node.tight.upper[axis];
-        if (Slices(lower, upper, parameters.bins).scale == 0) {
+        if (Slices(lower, upper, bins).scale == 0) {
             continue;
         }
-        for (int j = 0; j <= parameters.bins; ++j) {
-            const float position = slice_position(lower, upper, j, parameters.bins);
-            const uint32_t left = j == 0 ? 0 : j == parameters.bins ? node.count : counts.left[axis][j];
-            const uint32_t right = j == 0 ? node.count : j == parameters.bins ? 0 : counts.right[axis][j];
-            const bool inside = node.cell.lower[axis] < position && position < node.cell.upper[axis];
-            const bool affordable = uint64_t{left} + right <= node.count + node.spare;
-            const float left_area = shape.relative_area(axis, position - node.cell.lower[axis]);
-            const float right_area = shape.relative_area(axis, node.cell.upper[axis] - position);
-            float children = block * (left_area * expected_blocks(left) + right_area * expected_blocks(right));
-            if (left == 0 || right == 0) {
-                children *= bonus;
-            }
-            const float cost = traversal + children;
-            if (inside && affordable && cost < best_cost) {
-                best_cost = cost;
-                best = {axis, position};
-            }
+        counts.left[axis][0] = counts.right[axis][bins] = 0;
+        counts.left[axis][bins] = counts.right[axis][0] = node.count;
+        const auto last = hn::Set(di, bins);
+        for (int j = 0; j <= bins; j += static_cast<int>(hn::Lanes(d))) {
+            const auto plane = hn::Iota(di, j);
+            const auto fraction = hn::Mul(hn::ConvertTo(d, plane), hn::Set(d, 1.0F / static_cast<float>(bins)));
+            const auto between = hn::Add(hn::Set(d, lower), hn::Mul(hn::Set(d, upper - lower), fraction));
+            const auto position = hn::IfThenElse(hn::RebindMask(d, hn::Eq(plane, last)), hn::Set(d, upper), between);
+            const auto left = hn::Load(du, counts.left[axis] + j);
+            const auto right = hn::Load(du, counts.right[axis] + j);
+            const auto cost = costs(axis, position, expected_blocks(d, left), expected_blocks(d, right));
+            const auto counts_as = hn::AndNot(hn::Gt(plane, last), hn::Lt(hn::BitCast(di, hn::Add(left, right)), too_many));
+            cheapest.offer(axis * (bins + 1) + j, hn::IfThenElse(hn::RebindMask(d, counts_as), cost, hn::Inf(d)));
         }
     }
-    return best;
+    const auto leaf_cost =
+        static_cast<float>(parameters.sah.block) * hn::GetLane(expected_blocks(d, hn::Set(du, node.count)));
+    if (!(cheapest.cost() < leaf_cost)) {
+        return {};
+    }
+    const int axis = cheapest.index() / (bins + 1);
+    return {axis, slice_position(node.tight.lower[axis], node.tight.upper[axis], cheapest.index() % (bins + 1), bins)};
 }
 
 }  // namespace espalier::HWY_NAMESPACE

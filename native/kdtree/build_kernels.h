@@ -30,10 +30,11 @@ struct OpenNode {
     int depth;
 };
 
-/// References that begin before plane j, and that end behind it, per axis. Counts add up over parts of a node.
+/// References that begin before plane j, and that end behind it, per axis, for the planes between bins. Counts add up over parts of a
+/// node. There is room for both ends of the node's tight box, and for vector code to read on.
 struct BinCounts {
-    uint32_t left[3][kMaxBins];
-    uint32_t right[3][kMaxBins];
+    alignas(64) uint32_t left[3][kMaxBins + 16];
+    alignas(64) uint32_t right[3][kMaxBins + 16];
 };
 
 struct Split {
@@ -75,8 +76,8 @@ struct BuildKernels {
                                 RejectedFaces& rejected);
     /// Adds part of a node's references to its counts.
     void (*count_bins)(const References& references, uint32_t count, const Box3f& tight, int bins, BinCounts& counts);
-    /// The plane of least cost by the surface area heuristic, or a leaf.
-    Split (*choose_split)(const OpenNode& node, const BinCounts& counts, const BuildParameters& parameters);
+    /// The plane of least cost by the surface area heuristic, or a leaf. Fills in the counts at the ends of the tight box.
+    Split (*choose_split)(const OpenNode& node, BinCounts& counts, const BuildParameters& parameters);
     /// Sorts references by side, in order; those on both sides go to both. `left` may be `in` itself.
     Partition (*partition)(const TriangleSoup& soup, const References& in, uint32_t count, Split split, bool clip,
                            const References& left, const References& right);

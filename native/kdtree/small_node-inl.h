@@ -43,9 +43,8 @@ class SmallNode {
    public:
     HWY_INLINE SmallNode(const References& references, const OpenNode& node, const BuildParameters& parameters, SubtreeOutput& output)
         : parameters_(parameters),
-          traversal_(static_cast<float>(parameters.sah.traversal)),
-          block_(static_cast<float>(parameters.sah.block)),
-          bonus_(static_cast<float>(parameters.sah.empty_bonus)),
+          traversal_cost_(static_cast<float>(parameters.sah.traversal)),
+          block_cost_(static_cast<float>(parameters.sah.block)),
           references_(references),
           output_(output) {
         for (int axis = 0; axis < 3; ++axis) {
@@ -60,7 +59,7 @@ class SmallNode {
             box[3] = box[7] = 0;
         }
         const uint64_t all = node.count == 64 ? ~uint64_t{0} : (uint64_t{1} << node.count) - 1;
-        split(all, node.cell, node.spare, node.depth);
+        split(all, node);
     }
 
    private:
@@ -116,114 +115,86 @@ class SmallNode {
         right[kSlices] = 0;
     }
 
-    struct Candidate {
-        float cost;
-        int plane;
-    };
+    using D64 = hn::ScalableTag<uint64_t>;
+    using DF = hn::Rebind<float, D64>;
 
-    /// The cheapest plane inside the cell; of equal ones the first by axis and position.
-    HWY_INLINE Candidate best_plane(uint64_t members, const Box3f& cell, const CellShape& shape, uint64_t affordable) const {
-        const hn::ScalableTag<uint64_t> d64;
-        const hn::Rebind<uint32_t, decltype(d64)> d32;
-        const hn::RebindToSigned<decltype(d32)> di;
-        const hn::Rebind<float, decltype(d64)> df;
+    /// The cheapest plane inside the cell.
+    HWY_INLINE CheapestPlane<DF> cheapest_plane(uint64_t members, const SplitCosts<DF>& costs, uint64_t affordable) const {
+        const D64 d64;
+        const DF df;
+        const hn::RebindToUnsigned<DF> du;
+        const hn::RebindToSigned<DF> di;
         const auto member_bits = hn::Set(d64, members);
-        const auto round_up = hn::Set(d32, kBlockSize - 1);
+        const auto round_up = hn::Set(du, kBlockSize - 1);
         const auto too_many = hn::Set(di, static_cast<int32_t>(std::min<uint64_t>(affordable, 2 * kSmallNode) + 1));
-        const auto infinite = hn::Inf(df);
-        auto best_cost = infinite;
-        auto best_index = hn::Zero(di);
+        CheapestPlane cheapest(df);
         for (int axis = 0; axis < 3; ++axis) {
-            const auto lower = hn::Set(df, cell.lower[axis]);
-            const auto upper = hn::Set(df, cell.upper[axis]);
-            const float b = shape.side[(axis + 1) % 3];
-            const float c = shape.side[(axis + 2) % 3];
-            const auto base = hn::Set(df, b * c);
-            const auto slope = hn::Set(df, b + c);
-            const auto scale = hn::Set(df, shape.scale);
-            const auto inverse_area = hn::Set(df, shape.inverse_area);
             for (int j = 0; j < kPlanes; j += static_cast<int>(hn::Lanes(d64))) {
                 const int at = axis * kPlanes + j;
-                const auto left =
-                    hn::TruncateTo(d32, hn::PopulationCount(hn::And(hn::Load(d64, left_ + at), member_bits)));
-                const auto right =
-                    hn::TruncateTo(d32, hn::PopulationCount(hn::And(hn::Load(d64, right_ + at), member_bits)));
+                const auto left = hn::TruncateTo(du, hn::PopulationCount(hn::And(hn::Load(d64, left_ + at), member_bits)));
+                const auto right = hn::TruncateTo(du, hn::PopulationCount(hn::And(hn::Load(d64, right_ + at), member_bits)));
                 const auto left_blocks = hn::ConvertTo(df, hn::BitCast(di, hn::ShiftRight<3>(hn::Add(left, round_up))));
                 const auto right_blocks = hn::ConvertTo(df, hn::BitCast(di, hn::ShiftRight<3>(hn::Add(right, round_up))));
-                const auto position = hn::Load(df, positions_ + at);
-                // Written as in CellShape::relative_area.
-                const auto left_area =
-                    hn::Mul(hn::Add(base, hn::Mul(hn::Mul(hn::Sub(position, lower), scale), slope)), inverse_area);
-                const auto right_area =
-                    hn::Mul(hn::Add(base, hn::Mul(hn::Mul(hn::Sub(upper, position), scale), slope)), inverse_area);
-                auto children = hn::Mul(hn::Set(df, block_),
-                                        hn::Add(hn::Mul(left_area, left_blocks), hn::Mul(right_area, right_blocks)));
-                const auto one_is_empty = hn::Eq(hn::Min(left_blocks, right_blocks), hn::Zero(df));
-                children = hn::IfThenElse(one_is_empty, hn::Mul(children, hn::Set(df, bonus_)), children);
-                const auto inside = hn::And(hn::Lt(lower, position), hn::Lt(position, upper));
-                const auto is_affordable = hn::RebindMask(df, hn::Lt(hn::BitCast(di, hn::Add(left, right)), too_many));
-                const auto cost = hn::IfThenElse(hn::And(inside, is_affordable), hn::Add(hn::Set(df, traversal_), children), infinite);
-                const auto better = hn::Lt(cost, best_cost);
-                best_cost = hn::IfThenElse(better, cost, best_cost);
-                best_index = hn::IfThenElse(hn::RebindMask(di, better), hn::Iota(di, at), best_index);
+                const auto cost = costs(axis, hn::Load(df, positions_ + at), left_blocks, right_blocks);
+                const auto is_affordable = hn::Lt(hn::BitCast(di, hn::Add(left, right)), too_many);
+                cheapest.offer(at, hn::IfThenElse(hn::RebindMask(df, is_affordable), cost, hn::Inf(df)));
             }
         }
-        const auto least = hn::MinOfLanes(df, best_cost);
-        const auto none = hn::Set(di, std::numeric_limits<int32_t>::max());
-        const auto first = hn::MinOfLanes(di, hn::IfThenElse(hn::RebindMask(di, hn::Eq(best_cost, least)), best_index, none));
-        return {hn::GetLane(least), hn::GetLane(first)};
+        return cheapest;
     }
 
     /// Builds below a set of references; returns the cost of what was built, per ray that meets the cell.
-    float split(uint64_t members, const Box3f& cell, uint64_t spare, int depth) {
-        const auto count = static_cast<uint32_t>(std::popcount(members));
-        const float leaf_cost = block_ * static_cast<float>(block_count(count));
-        const CellShape shape(cell);
-        if (leaf_cost <= traversal_ || depth >= parameters_.sah.max_depth || !shape.is_splittable()) {
-            write_leaf(members, count, cell);
+    float split(uint64_t members, const OpenNode& node) {
+        const float leaf_cost = block_cost_ * static_cast<float>(block_count(node.count));
+        const CellShape shape(node.cell);
+        // A leaf of one block is cheaper than any step.
+        if (leaf_cost <= traversal_cost_ || node.depth >= parameters_.sah.max_depth || !shape.is_splittable()) {
+            write_leaf(members, node);
             return leaf_cost;
         }
-        const Candidate best = best_plane(members, cell, shape, count + spare);
-        if (!(best.cost < leaf_cost)) {
-            write_leaf(members, count, cell);
+        const DF df;
+        const SplitCosts<DF> costs(df, node, shape, parameters_.sah);
+        const CheapestPlane<DF> cheapest = cheapest_plane(members, costs, node.count + node.spare);
+        if (!(cheapest.cost() < leaf_cost)) {
+            write_leaf(members, node);
             return leaf_cost;
         }
-        const int axis = best.plane / kPlanes;
-        const float position = positions_[best.plane];
-        const uint64_t left_members = members & left_[best.plane];
-        const uint64_t right_members = members & right_[best.plane];
-        OpenNode parent{cell, {}, count, spare, depth};
+        const int plane = cheapest.index();
+        const Split split_at{plane / kPlanes, positions_[plane]};
+        const uint64_t left_members = members & left_[plane];
+        const uint64_t right_members = members & right_[plane];
+        const Partition parts{static_cast<uint32_t>(std::popcount(left_members)), static_cast<uint32_t>(std::popcount(right_members)), {}, {}};
         OpenNode left;
         OpenNode right;
-        open_children(parent, {axis, position},
-                      {static_cast<uint32_t>(std::popcount(left_members)), static_cast<uint32_t>(std::popcount(right_members)), {}, {}},
-                      left, right);
+        open_children(node, split_at, parts, left, right);
 
-        const size_t node = output_.nodes.size();
+        const size_t index = output_.nodes.size();
         const size_t first_triangle = output_.triangles.size();
         output_.nodes.push_back(KdNode::leaf(0, 0));
         output_.boxes.emplace_back();
-        const float left_cost = split(left_members, left.cell, left.spare, left.depth);
+        const float left_cost = split(left_members, left);
         const size_t right_child = output_.nodes.size();
-        const float right_cost = split(right_members, right.cell, right.spare, right.depth);
-        const float cost = traversal_ + (shape.relative_area(axis, position - cell.lower[axis]) * left_cost +
-                                         shape.relative_area(axis, cell.upper[axis] - position) * right_cost);
+        const float right_cost = split(right_members, right);
+        const auto area = [&](const OpenNode& child) {
+            return hn::GetLane(costs.relative_area(split_at.axis, hn::Set(df, child.cell.size()[split_at.axis])));
+        };
+        const float cost = traversal_cost_ + (area(left) * left_cost + area(right) * right_cost);
         if (leaf_cost <= cost) {  // the promise of the greedy choice was not kept: take the split back
-            output_.nodes.erase(output_.nodes.begin() + static_cast<std::ptrdiff_t>(node), output_.nodes.end());
-            output_.boxes.resize(node);
+            output_.nodes.erase(output_.nodes.begin() + static_cast<std::ptrdiff_t>(index), output_.nodes.end());
+            output_.boxes.resize(index);
             output_.triangles.resize(first_triangle);
-            write_leaf(members, count, cell);
+            write_leaf(members, node);
             return leaf_cost;
         }
-        output_.nodes[node] = KdNode::inner(axis, position, static_cast<uint32_t>(right_child));
-        Box3f box = output_.boxes[node + 1];
+        output_.nodes[index] = KdNode::inner(split_at.axis, split_at.position, static_cast<uint32_t>(right_child));
+        Box3f box = output_.boxes[index + 1];
         box.extend(output_.boxes[right_child]);
-        output_.boxes[node] = box;
+        output_.boxes[index] = box;
         return cost;
     }
 
-    HWY_INLINE void write_leaf(uint64_t members, uint32_t count, const Box3f& cell) {
-        LeafWriter leaf(output_, count);
+    HWY_INLINE void write_leaf(uint64_t members, const OpenNode& node) {
+        LeafWriter leaf(output_, node.count);
         const hn::CappedTag<float, 8> d;
         constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<float, 8>());
         alignas(64) float box[8];
@@ -237,16 +208,15 @@ class SmallNode {
         }
         Box3f tight;
         for (int axis = 0; axis < 3; ++axis) {
-            tight.lower[axis] = std::max(box[axis], cell.lower[axis] - reach_[axis]) + 0.0F;
-            tight.upper[axis] = std::min(-box[axis + 4], cell.upper[axis] + reach_[axis]) + 0.0F;
+            tight.lower[axis] = std::max(box[axis], node.cell.lower[axis] - reach_[axis]) + 0.0F;
+            tight.upper[axis] = std::min(-box[axis + 4], node.cell.upper[axis] + reach_[axis]) + 0.0F;
         }
-        leaf.finish(count == 0 ? Box3f{} : tight);
+        leaf.finish(node.count == 0 ? Box3f{} : tight);
     }
 
     const BuildParameters& parameters_;
-    float traversal_;
-    float block_;
-    float bonus_;
+    float traversal_cost_;
+    float block_cost_;
     const References& references_;
     SubtreeOutput& output_;
     float reach_[3];
