@@ -393,8 +393,8 @@ def lamps() -> None:
         light("AREA", "#cfe2ff", 45 * depth, (-3.15, y, 1.6), (0, y, 1.2), shape="RECTANGLE", size=1.6, size_y=depth)
     light("AREA", "#ffe9cf", 38, (0.3, 0.2, 2.75), (0.3, 0.2, 0), shape="RECTANGLE", size=3.5, size_y=3.5)
     light("AREA", "#fff1e0", 42, (0.4, -3.3, 1.7), (0.2, 3, 1.2), shape="DISK", size=2.2)
-    # What the floor would throw back on the ceiling, since only direct light is traced.
-    light("AREA", "#ffe0bd", 34, (0, 0.3, 0.03), (0, 0.3, 2), shape="RECTANGLE", size=5.5, size_y=5.5)
+    # What the floor would throw back on ceiling and undersides, since only direct light is traced.
+    light("SUN", "#ffe0bd", 0.5, (0, 0, -1), (0, 0, 0), use_shadow=False)
 
 
 def build() -> None:
