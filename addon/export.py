@@ -244,7 +244,12 @@ class _InstanceReader:
         self.mesh_of_pointer: dict[int, int | None] = {}
         self.material_of_pointer: dict[int, int] = {}
         self.slots_of_data: dict[tuple[int, str], tuple[int, ...]] = {}
+        # Objects of a background set are in no view layer, and drawn.
         self.visible_of_pointer: dict[int, bool] = {}
+        background = depsgraph.scene.background_set
+        while background is not None:
+            self.visible_of_pointer.update((item.as_pointer(), True) for item in background.objects)
+            background = background.background_set
         self.matrices: list[Matrix] = []
 
     def read(self) -> float:
@@ -277,10 +282,7 @@ class _InstanceReader:
         shown_by = (instance.parent if instance.is_instance else instance.object).original
         pointer = shown_by.as_pointer()
         if pointer not in self.visible_of_pointer:
-            layer = self.depsgraph.view_layer
-            # Objects of a background set are in no view layer, and drawn.
-            of_set = layer.objects.get(shown_by.name) != shown_by
-            self.visible_of_pointer[pointer] = of_set or shown_by.visible_get(view_layer=layer)
+            self.visible_of_pointer[pointer] = shown_by.visible_get(view_layer=self.depsgraph.view_layer)
         return self.visible_of_pointer[pointer]
 
     def place(self, instance: bpy.types.DepsgraphObjectInstance) -> None:
@@ -315,7 +317,8 @@ class _InstanceReader:
         found = self.slots_of_data.get(key)
         if found is None:
             table = [self.material(slot.material) for slot in owner.material_slots] or [0]
-            table.extend(itertools.repeat(table[-1], slot_count - len(table)))
+            if len(table) < slot_count:
+                table.extend([table[-1]] * (slot_count - len(table)))
             found = self.slots_of_data[key] = tuple(table)
         return found
 
