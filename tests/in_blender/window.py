@@ -51,11 +51,14 @@ def shoot(path: Path) -> None:
     subprocess.run(["import", "-window", "root", str(path)], check=True, timeout=60)
 
 
-def click(x: float, y: float) -> None:
-    """Presses the left mouse button at a place counted from the screen's lower left corner"""
+def click(x: float, y: float) -> Iterator[bool]:
+    """Moves the mouse to a place counted from the screen's lower left corner and clicks, Blender seeing each step"""
     height = bpy.context.window_manager.windows[0].height
-    place = [str(round(x)), str(round(height - y))]
-    subprocess.run(["xdotool", "mousemove", *place, "sleep", "0.3", "click", "1"], check=True, timeout=60)
+    # The first move only enters the region; a button wakes at the second.
+    moves = [["mousemove", str(round(x) - shift), str(round(height - y))] for shift in (3, 0)]
+    for act in (*moves, ["mousedown", "1"], ["mouseup", "1"]):
+        subprocess.run(["xdotool", *act], check=True, timeout=60)
+        yield True
 
 
 def steps(zip_file: str, folder: Path) -> Iterator[bool]:
@@ -87,7 +90,7 @@ def steps(zip_file: str, folder: Path) -> Iterator[bool]:
     unit = 20.0 * bpy.context.preferences.system.ui_scale
     top = sidebar.y + sidebar.height
     middle = sidebar.x + 0.4 * sidebar.width
-    click(middle, top - 3.45 * unit)
+    yield from click(middle, top - 3.65 * unit)
     yield from until(lambda: session.last_report(scene, session.COMPARE) is not None, "the comparison to end")
     yield from until(overlay.is_on, "the overlay")
     area.tag_redraw()
@@ -126,7 +129,7 @@ def steps(zip_file: str, folder: Path) -> Iterator[bool]:
         )
     )
 
-    click(middle, top - 2.2 * unit)
+    yield from click(middle, top - 2.4 * unit)
     yield from until(lambda: session.last_report(scene, session.PREVIEW) is not None, "the preview to end")
     yield from until(lambda: operators._Watched.running is None, "the operator to end")
     image = bpy.data.images["Espalier Preview"]
