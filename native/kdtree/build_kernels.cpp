@@ -11,6 +11,7 @@
 #include <hwy/highway.h>
 
 #include "kdtree/binning-inl.h"
+#include "kdtree/blocks-inl.h"
 #include "kdtree/bounds-inl.h"
 #include "kdtree/partition-inl.h"
 #include "kdtree/small_node-inl.h"
@@ -21,12 +22,11 @@ namespace espalier::HWY_NAMESPACE {
 /// Splits one node after the other, depth first. Left children stay where their parent's references lay, right ones wait behind.
 class SubtreeBuilder {
    public:
-    SubtreeBuilder(const SubtreeInput& input, const OpenNode& root, SubtreeOutput& output)
-        : input_(input), output_(output), soft_limit_(size_t{2} * root.count) {}
+    SubtreeBuilder(const SubtreeInput& input, SubtreeOutput& output) : input_(input), output_(output) {}
 
     /// Builds below a node whose references begin at `begin`; from `room` on there is space for right children.
     void build(const OpenNode& node, size_t begin, size_t room) {
-        const References references = input_.references->references().at(begin);
+        const References references = at(begin);
         if (node.count <= kSmallNode) {
             const SmallNode finish(references, node, *input_.parameters, output_);
             return;
@@ -37,7 +37,7 @@ class SubtreeBuilder {
         BinCounts counts{};
         count_bins(references, node.count, node.tight, input_.parameters->bins, counts);
         const Split split = choose_split(node, counts, *input_.parameters);
-        if (split.axis < 0 || room + node.count > input_.references->capacity()) {
+        if (split.axis < 0) {
             write_leaf(node, references);
             return;
         }
@@ -45,8 +45,11 @@ class SubtreeBuilder {
         size_t right_begin = begin;
         size_t right_room = room;
         if (!cuts_empty_space(node, split, parts)) {
-            parts = partition(*input_.soup, references, node.count, split, input_.parameters->clip, references,
-                              input_.references->references().at(room));
+            if (room + node.count > input_.references->capacity()) {
+                build_elsewhere(node, references);
+                return;
+            }
+            parts = partition(*input_.soup, references, node.count, split, input_.parameters->clip, references, at(room));
             right_begin = room;
             right_room = room + parts.right_count;
         }
@@ -58,8 +61,8 @@ class SubtreeBuilder {
         output_.nodes.push_back(KdNode::leaf(0, 0));
         output_.boxes.emplace_back();
         build(left, begin, right_room);
-        if (right_room > soft_limit_ && right_begin != begin) {  // the parent's place is free: take it
-            move_references(right_begin, begin, right.count);
+        if (right_begin != begin && right_room + right.count > input_.references->capacity()) {
+            copy_references(at(right_begin), right.count, references);  // the parent's place is free
             right_begin = begin;
             right_room = room;
         }
@@ -72,6 +75,16 @@ class SubtreeBuilder {
     }
 
    private:
+    References at(size_t place) const { return input_.references->references().at(place); }
+
+    /// For scenes whose every plane leaves nearly all references on one side, or on both.
+    void build_elsewhere(const OpenNode& node, const References& references) {
+        const ReferenceBuffer buffer(subtree_room(node.count));
+        copy_references(references, node.count, buffer.references());
+        const SubtreeInput input{input_.soup, input_.parameters, input_.cancel, &buffer};
+        SubtreeBuilder(input, output_).build(node, 0, node.count);
+    }
+
     void write_leaf(const OpenNode& node, const References& references) {
         LeafWriter leaf(output_, node.count);
         for (uint32_t i = 0; i < node.count; ++i) {
@@ -80,20 +93,15 @@ class SubtreeBuilder {
         leaf.finish(node.tight);
     }
 
-    void move_references(size_t from, size_t to, uint32_t count) {
-        copy_references(input_.references->references().at(from), count, input_.references->references().at(to));
-    }
-
     const SubtreeInput& input_;
     SubtreeOutput& output_;
-    size_t soft_limit_;  ///< beyond this much of the room, waiting references are moved down
 };
 
 void build_subtree(const SubtreeInput& input, const OpenNode& node, SubtreeOutput& output) {
-    SubtreeBuilder(input, node, output).build(node, 0, node.count);
+    SubtreeBuilder(input, output).build(node, 0, node.count);
 }
 
-constexpr BuildKernels kKernels{make_references, count_bins, choose_split, partition, build_subtree};
+constexpr BuildKernels kKernels{make_references, count_bins, choose_split, partition, build_subtree, write_blocks};
 
 }  // namespace espalier::HWY_NAMESPACE
 HWY_AFTER_NAMESPACE();

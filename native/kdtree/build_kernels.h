@@ -61,12 +61,12 @@ struct SubtreeInput {
     const TriangleSoup* soup;
     const BuildParameters* parameters;
     const std::atomic<bool>* cancel;
-    const ReferenceBuffer* references;  ///< the node's own, at the start; everything behind them is room for right children
+    const ReferenceBuffer* references;  ///< the node's own, at the start; behind them is room for right children
 };
 
-/// References that a subtree may need room for at once: its own, the right children that wait, and one partition in progress.
-inline size_t subtree_room(uint32_t count, uint64_t spare) {
-    return size_t{4} * count + size_t{2} * spare;
+/// Room for a subtree's references, and for the right children that wait while left ones are built: rarely more than as many again.
+inline size_t subtree_room(uint32_t count) {
+    return size_t{2} * count + count / 4 + 1024;
 }
 
 /// The inner loops of the builder, compiled once for each instruction set. All give the same tree bit for bit.
@@ -83,6 +83,8 @@ struct BuildKernels {
                            const References& left, const References& right);
     /// Appends everything below a node to the output. Throws BuildCancelled.
     void (*build_subtree)(const SubtreeInput& input, const OpenNode& node, SubtreeOutput& output);
+    /// Fills blocks from kBlockSize face indices each.
+    void (*write_blocks)(const TriangleSoup& soup, const uint32_t* triangles, size_t count, TriangleBlock* blocks);
 };
 
 /// The kernels for the instruction set in use (see simd_target.h).

@@ -103,7 +103,7 @@ class Builder {
     /// One thread needs no top levels: all references in one piece, and one subtree.
     void make_references_alone() {
         const uint32_t triangles = soup_.size();
-        rooms_[0] = ReferenceBuffer(subtree_room(triangles, spare_references(triangles)));
+        rooms_[0] = ReferenceBuffer(subtree_room(triangles));
         const uint32_t count = build_kernels().make_references(soup_, 0, triangles, rooms_[0].references(), tree_.bounds,
                                                                tree_.report.rejected_faces);
         whole_ = {tree_.bounds, tree_.bounds, count, spare_references(triangles), 0};
@@ -126,7 +126,7 @@ class Builder {
                          [&](uint32_t a, uint32_t b) { return subtrees_[a].root->count > subtrees_[b].root->count; });
         size_t room = 0;
         for (const Subtree& subtree : subtrees_) {
-            room = std::max(room, subtree_room(subtree.root->count, subtree.root->spare));
+            room = std::max(room, subtree_room(subtree.root->count));
         }
         parallel_for(threads_, subtrees_.size(), [&](size_t i, int worker) {
             const auto w = static_cast<size_t>(worker);

@@ -11,8 +11,8 @@
 
 namespace espalier {
 
-/// Room for `capacity` items straight from the operating system, in huge pages where it has them. Memory is taken only
-/// when it is first written, so a generous capacity costs address space and nothing else. Items start as zero bytes.
+/// Room for `capacity` items straight from the operating system, in huge pages where that pays. Memory is taken only when it is first
+/// written. Items start as zero bytes.
 template <class T>
 class LargeBuffer {
     static_assert(std::is_trivially_copyable_v<T>);
@@ -27,7 +27,9 @@ class LargeBuffer {
         if (memory == MAP_FAILED) {
             throw std::bad_alloc();
         }
-        ::madvise(memory, bytes(), MADV_HUGEPAGE);
+        if (bytes() >= kHugePagesFrom) {
+            ::madvise(memory, bytes(), MADV_HUGEPAGE);
+        }
         data_ = static_cast<T*>(memory);
     }
     LargeBuffer(LargeBuffer&& other) noexcept
@@ -52,6 +54,7 @@ class LargeBuffer {
     std::span<const T> span() const { return {data_, capacity_}; }
 
    private:
+    static constexpr size_t kHugePagesFrom = size_t{4} << 20;  ///< below, clearing the rest of the last page costs more than it saves
     T* data_ = nullptr;
     size_t capacity_ = 0;
 };

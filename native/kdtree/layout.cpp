@@ -6,6 +6,7 @@
 #include <bit>
 #include <vector>
 
+#include "kdtree/build_kernels.h"
 #include "kdtree/parallel.h"
 
 namespace espalier {
@@ -46,12 +47,6 @@ class Collapse {
     }
 
    private:
-    struct Opened {
-        int axis;
-        int left;   ///< slot of the left part; -1 if it is empty
-        int right;
-    };
-
     Item item(uint32_t node) const {
         const KdNode kd = tree_.nodes[node];
         const Box3f& box = boxes_[node];
@@ -76,8 +71,8 @@ class Collapse {
 
     uint32_t collapse(const Item& root, std::vector<WideNode>& out, const std::vector<Run>* runs) const {
         std::array<Item, WideNode::kWidth> items;
-        // Per octant the slots of `items` from the nearest to the farthest.
-        std::array<std::array<uint8_t, WideNode::kWidth>, 8> order{};
+        // Per octant the slots of `items`, 4 bits each, the farthest lowest.
+        std::array<uint32_t, 8> order{};
         int count = 1;
         items[0] = root;
         for (;;) {
@@ -99,13 +94,14 @@ class Collapse {
             }
         }
         for (size_t octant = 0; octant < 8; ++octant) {
-            uint32_t word = 0;
-            for (int rank = 0; rank < count; ++rank) {
-                word |= uint32_t{order[octant][static_cast<size_t>(rank)]} << (3 * (WideNode::kWidth - 1 - rank));
-            }
             // Unused slots come first, that is farthest: no ray meets them, but each slot has to appear once.
+            uint32_t word = 0;
+            int place = 0;
             for (int slot = count; slot < WideNode::kWidth; ++slot) {
-                word |= static_cast<uint32_t>(slot) << (3 * (WideNode::kWidth - 1 - slot));
+                word |= static_cast<uint32_t>(slot) << (3 * place++);
+            }
+            for (int rank = 0; rank < count; ++rank) {
+                word |= (order[octant] >> (4 * rank) & 7U) << (3 * place++);
             }
             made.order[octant] = word;
         }
@@ -141,8 +137,7 @@ class Collapse {
     }
 
     /// Replaces an item by its two parts, the near one first in each octant's order.
-    void open(std::array<Item, WideNode::kWidth>& items, int& count, int slot,
-              std::array<std::array<uint8_t, WideNode::kWidth>, 8>& order) const {
+    void open(std::array<Item, WideNode::kWidth>& items, int& count, int slot, std::array<uint32_t, 8>& order) const {
         const Item opened = items[static_cast<size_t>(slot)];
         int axis = 0;
         if (opened.blocks != 0) {
@@ -166,12 +161,17 @@ class Collapse {
             items[static_cast<size_t>(count)] = item(right);
         }
         for (unsigned octant = 0; octant < 8; ++octant) {
-            auto& ranks = order[octant];
-            const auto place = std::find(ranks.begin(), ranks.begin() + count, static_cast<uint8_t>(slot));
-            std::copy_backward(place + 1, ranks.begin() + count, ranks.begin() + count + 1);
-            const bool from_right = (octant >> axis & 1U) != 0;
-            *place = static_cast<uint8_t>(from_right ? count : slot);
-            *(place + 1) = static_cast<uint8_t>(from_right ? slot : count);
+            // The two take the place of the opened one, and everything nearer moves up by one.
+            const bool left_is_nearer = (octant >> axis & 1U) == 0;
+            const uint32_t near = left_is_nearer ? static_cast<uint32_t>(slot) : static_cast<uint32_t>(count);
+            const uint32_t far = left_is_nearer ? static_cast<uint32_t>(count) : static_cast<uint32_t>(slot);
+            int shift = 0;
+            while ((order[octant] >> shift & 15U) != static_cast<uint32_t>(slot)) {
+                shift += 4;
+            }
+            const uint32_t farther = order[octant] & ((1U << shift) - 1);
+            const uint32_t nearer = static_cast<uint32_t>(uint64_t{order[octant]} >> (shift + 4) << (shift + 8));
+            order[octant] = nearer | (near << (shift + 4)) | (far << shift) | farther;
         }
         ++count;
     }
@@ -192,19 +192,6 @@ void find_runs(const Tree& tree, uint32_t begin, uint32_t end, uint32_t longest,
     }
     find_runs(tree, begin + 1, node.right_child(), longest, runs);
     find_runs(tree, node.right_child(), end, longest, runs);
-}
-
-void write_block(const TriangleSoup& soup, const uint32_t* triangles, TriangleBlock& block) {
-    for (uint32_t lane = 0; lane < kBlockSize; ++lane) {
-        const uint32_t triangle = triangles[lane];
-        block.triangle[lane] = triangle;
-        for (int corner = 0; corner < 3; ++corner) {
-            const Vec3f v = triangle == kNoTriangle ? Vec3f{NAN, NAN, NAN} : soup.vertex(triangle, corner);
-            for (int axis = 0; axis < 3; ++axis) {
-                block.vertex[corner][axis][lane] = v[axis];
-            }
-        }
-    }
 }
 
 }  // namespace
@@ -230,9 +217,8 @@ void build_layout(const TriangleSoup& soup, const LargeBuffer<Box3f>& boxes, con
             return;
         }
         const size_t begin = (i - runs.size()) * kBlocksPerTask;
-        for (size_t b = begin; b < std::min(begin + kBlocksPerTask, blocks); ++b) {
-            write_block(soup, triangles.data() + b * kBlockSize, tree.blocks[b]);
-        }
+        const size_t count = std::min(kBlocksPerTask, blocks - begin);
+        build_kernels().write_blocks(soup, triangles.data() + begin * kBlockSize, count, tree.blocks.data() + begin);
     });
 
     // The wide nodes above the runs, whose number is small. A tree that is one run has none.

@@ -20,9 +20,6 @@ uint32_t with_slack(uint32_t count) {
     return count + count / 4 + 2 * kMargin;
 }
 
-/// Levels that may move every right half elsewhere before the buffer is full. Pages that are not used are never taken.
-constexpr size_t kBufferLevels = 12;
-
 void add(const BinCounts& part, BinCounts& sum) {
     for (int axis = 0; axis < 3; ++axis) {
         for (int j = 0; j < kMaxBins; ++j) {
@@ -34,6 +31,16 @@ void add(const BinCounts& part, BinCounts& sum) {
 
 }  // namespace
 
+References SegmentMemory::take(uint32_t count) {
+    const std::lock_guard lock(mutex_);
+    if (used_ + count > buffers_.back().capacity()) {
+        buffers_.emplace_back(std::max<size_t>(buffers_.front().capacity() / 2, count));
+        used_ = 0;
+    }
+    used_ += count;
+    return buffers_.back().references().at(used_ - count);
+}
+
 TopLevels::TopLevels(const TriangleSoup& soup, const BuildParameters& parameters, const std::atomic<bool>* cancel, int threads)
     : soup_(soup),
       parameters_(parameters),
@@ -41,7 +48,7 @@ TopLevels::TopLevels(const TriangleSoup& soup, const BuildParameters& parameters
       threads_(threads),
       kernels_(build_kernels()),
       segment_size_(choose_segment_size(soup.size())),
-      references_(kBufferLevels * (size_t{2} * soup.size() + segment_size_)) {}
+      memory_(size_t{2} * soup.size() + 2 * with_slack(segment_size_)) {}
 
 void TopLevels::make_references() {
     const uint32_t triangles = soup_.size();
@@ -53,12 +60,10 @@ void TopLevels::make_references() {
     parallel_for(threads_, count, [&](size_t i) {
         const auto begin = static_cast<uint32_t>(i * segment_size_);
         const uint32_t end = std::min(begin + segment_size_, triangles);
-        const size_t place = i * with_slack(segment_size_);
-        const uint32_t made =
-            kernels_.make_references(soup_, begin, end, references_.references().at(place), bounds[i], rejected[i]);
-        root.segments[i] = {place, made, with_slack(segment_size_)};
+        const uint32_t capacity = with_slack(segment_size_);
+        const References place = memory_.take(capacity);
+        root.segments[i] = {place, kernels_.make_references(soup_, begin, end, place, bounds[i], rejected[i]), capacity};
     });
-    used_ = count * with_slack(segment_size_);
 
     Box3f box;
     uint32_t valid = 0;
@@ -87,18 +92,13 @@ void TopLevels::split_above(uint32_t cut) {
     std::vector<uint32_t> level{0};
     for (;;) {
         std::erase_if(level, [&](uint32_t node) { return nodes_[node].node.count <= std::max(cut, kSmallNode); });
-        size_t references = 0;
-        for (const uint32_t node : level) {
-            references += nodes_[node].node.count;
-        }
-        const std::vector<Part> parts = parts_of(level);
-        // Whatever is left unsplit here becomes a subtree: who builds a node does not change the tree.
-        if (level.empty() || used_ + 2 * references + parts.size() * 2 * kMargin > references_.capacity()) {
+        if (level.empty()) {
             return;
         }
         if (cancel_ != nullptr && cancel_->load(std::memory_order_relaxed)) {
             throw BuildCancelled();
         }
+        const std::vector<Part> parts = parts_of(level);
         choose_splits(level, parts);
         level = open_level(level, parts);
     }
@@ -110,7 +110,7 @@ void TopLevels::choose_splits(const std::vector<uint32_t>& level, const std::vec
         const TopNode& top = nodes_[parts[i].node];
         const Segment& segment = top.segments[parts[i].segment];
         counts[i] = {};
-        kernels_.count_bins(references_.references().at(segment.begin), segment.count, top.node.tight, parameters_.bins, counts[i]);
+        kernels_.count_bins(segment.references, segment.count, top.node.tight, parameters_.bins, counts[i]);
     });
     size_t first = 0;
     for (const uint32_t node : level) {
@@ -125,20 +125,19 @@ void TopLevels::choose_splits(const std::vector<uint32_t>& level, const std::vec
 
 Partition TopLevels::partition_segment(const TopNode& top, const Segment& segment, const References& scratch, Segment& left,
                                        Segment& right) {
-    const References here = references_.references().at(segment.begin);
     const Partition parts =
-        kernels_.partition(soup_, here, segment.count, top.split, parameters_.clip, here, scratch);
+        kernels_.partition(soup_, segment.references, segment.count, top.split, parameters_.clip, segment.references, scratch);
     const uint32_t both = parts.left_count + parts.right_count;
     if (both + 2 * kMargin <= segment.capacity) {
         const uint32_t left_capacity = parts.left_count + (segment.capacity - both) / 2;
-        left = {segment.begin, parts.left_count, left_capacity};
-        right = {segment.begin + left_capacity, parts.right_count, segment.capacity - left_capacity};
+        left = {segment.references, parts.left_count, left_capacity};
+        right = {segment.references.at(left_capacity), parts.right_count, segment.capacity - left_capacity};
     } else {
         const uint32_t capacity = with_slack(parts.right_count);
-        left = {segment.begin, parts.left_count, segment.capacity};
-        right = {used_.fetch_add(capacity, std::memory_order_relaxed), parts.right_count, capacity};
+        left = {segment.references, parts.left_count, segment.capacity};
+        right = {memory_.take(capacity), parts.right_count, capacity};
     }
-    copy_references(scratch, parts.right_count, references_.references().at(right.begin));
+    copy_references(scratch, parts.right_count, right.references);
     return parts;
 }
 
@@ -197,7 +196,7 @@ std::vector<uint32_t> TopLevels::open_level(const std::vector<uint32_t>& level, 
 void TopLevels::gather(const TopNode& node, const References& to) const {
     size_t place = 0;
     for (const Segment& segment : node.segments) {
-        copy_references(references_.references().at(segment.begin), segment.count, to.at(place));
+        copy_references(segment.references, segment.count, to.at(place));
         place += segment.count;
     }
 }

@@ -1,18 +1,31 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 #pragma once
 
-#include <memory>
+#include <deque>
+#include <mutex>
 #include <vector>
 
 #include "kdtree/build_kernels.h"
 
 namespace espalier {
 
-/// A run of a node's references in the shared buffer. A node of the top levels is a list of them, in order.
+/// A run of a node's references in shared memory. A node of the top levels is a list of them, in order.
 struct Segment {
-    size_t begin;
+    References references;
     uint32_t count;
     uint32_t capacity;
+};
+
+/// Memory for segments, handed out to any thread.
+class SegmentMemory {
+   public:
+    explicit SegmentMemory(size_t capacity) { buffers_.emplace_back(capacity); }
+    References take(uint32_t count);
+
+   private:
+    std::mutex mutex_;
+    std::deque<ReferenceBuffer> buffers_;
+    size_t used_ = 0;  ///< of the last buffer
 };
 
 /// A node of the top of the tree: split further, or the root of a subtree.
@@ -57,8 +70,7 @@ class TopLevels {
     const int threads_;
     const BuildKernels& kernels_;
     const uint32_t segment_size_;
-    ReferenceBuffer references_;
-    std::atomic<size_t> used_{0};
+    SegmentMemory memory_;
     std::vector<TopNode> nodes_;
     RejectedFaces rejected_;
 };
