@@ -21,7 +21,7 @@ ADDON := blender_manifest.toml $(wildcard addon/*.py)
 export PATH := $(CURDIR)/.venv/bin:$(PATH)
 
 preview: native $(if $(filter build/scenes/%,$(SCENE)),$(SCENE))
-	@python -c 'import sys; from addon.cli import main; sys.exit(main(sys.argv[1:]))' preview "$(SCENE)" \
+	@python -m addon preview "$(SCENE)" \
 		--output build/preview/preview.png --json build/preview/timings.json
 
 build/scenes/%.blend: scenes/%.py scenes/kit.py | python
