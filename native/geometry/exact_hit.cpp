@@ -12,13 +12,9 @@ ExactVec exact_difference(Vec3f a, Vec3f b) {
     return {Expansion::difference(a.x, b.x), Expansion::difference(a.y, b.y), Expansion::difference(a.z, b.z)};
 }
 
-ExactVec exact(Vec3f a) {
-    return {Expansion(a.x), Expansion(a.y), Expansion(a.z)};
-}
+ExactVec exact(Vec3f a) { return {Expansion(a.x), Expansion(a.y), Expansion(a.z)}; }
 
-Expansion exact_dot(const ExactVec& a, const ExactVec& b) {
-    return a.x * b.x + a.y * b.y + a.z * b.z;
-}
+Expansion exact_dot(const ExactVec& a, const ExactVec& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
 
 ExactVec exact_cross(const ExactVec& a, const ExactVec& b) {
     return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
@@ -43,8 +39,8 @@ struct Side {
     double error;
 };
 
-/// Each difference from the origin carries a relative error e = 2^-53, each product one more, each sum one more: below 8 e times the sum of
-/// the terms' absolute values, of which 16 e is taken.
+/// Each difference from the origin carries a relative error e = 2^-53, each product one more, each sum one more: below
+/// 8 e times the sum of the terms' absolute values, of which 16 e is taken.
 Side measure_side(Vec3d d, Vec3d p, Vec3d q) {
     const Vec3d c{p.y * q.z - p.z * q.y, p.z * q.x - p.x * q.z, p.x * q.y - p.y * q.x};
     const double size = std::abs(d.x) * (std::abs(p.y * q.z) + std::abs(p.z * q.y)) +
@@ -102,7 +98,8 @@ bool hit_exactly(Vec3f origin, Vec3f direction, const Vec3f (&corner)[3], ExactH
     for (int k = 0; k < 3; ++k) {
         hit.corner[k] = corner[k];
     }
-    // The weighted mean of the corners along the direction's largest axis. The weights' errors count by the corners' spread.
+    // The weighted mean of the corners along the direction's largest axis. The weights' errors count by the corners'
+    // spread.
     const int axis = largest_component(direction);
     const double z[3] = {p[0][axis], p[1][axis], p[2][axis]};
     const double spread = std::max({z[0], z[1], z[2]}) - std::min({z[0], z[1], z[2]});

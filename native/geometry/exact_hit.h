@@ -16,11 +16,12 @@ struct ExactHit {
     int32_t triangle;
 };
 
-/// Decides as infinite precision would whether the line origin + t direction meets the closed triangle in one point; a line in the
-/// triangle's plane does not. On a hit fills in everything but `triangle`: t to a relative error of 2^-27, u and v to 2^-26.
+/// Decides as infinite precision would whether the line origin + t direction meets the closed triangle in one point; a
+/// line in the triangle's plane does not. On a hit fills in everything but `triangle`: t to a relative error of 2^-27,
+/// u and v to 2^-26.
 ///
-/// All coordinates are floats of at most 2^60 (kMaxCoordinate), the direction's largest component lies in [2^-100, 2^100], and the triangle
-/// has an area.
+/// All coordinates are floats of at most 2^60 (kMaxCoordinate), the direction's largest component lies in [2^-100,
+/// 2^100], and the triangle has an area.
 bool hit_exactly(Vec3f origin, Vec3f direction, const Vec3f (&corner)[3], ExactHit& hit);
 
 /// The sign of a's true distance less b's.

@@ -6,12 +6,12 @@
 
 namespace espalier {
 
-/// An exact number: the sum of doubles that do not overlap, smallest first, as in Shewchuk 1997, "Adaptive precision floating-point
-/// arithmetic and fast robust geometric predicates". Sums, differences and products of floats stay exact as long as no product of their
-/// parts leaves double's range, which holds for up to seven factors that are differences of floats of at most 2^61: all are
-/// multiples of 2^-149, and so the product's last bit lies above 2^-1074.
+/// An exact number: the sum of doubles that do not overlap, smallest first, as in Shewchuk 1997, "Adaptive precision
+/// floating-point arithmetic and fast robust geometric predicates". Sums, differences and products of floats stay exact
+/// as long as no product of their parts leaves double's range, which holds for up to seven factors that are differences
+/// of floats of at most 2^61: all are multiples of 2^-149, and so the product's last bit lies above 2^-1074.
 class Expansion {
-   public:
+ public:
     Expansion() = default;
     explicit Expansion(double value) {
         if (value != 0) {
@@ -62,7 +62,7 @@ class Expansion {
         return sum;
     }
 
-   private:
+ private:
     /// GROW-EXPANSION with zero elimination: each step is TWO-SUM (Knuth).
     void grow(double value) {
         size_t kept = 0;

@@ -9,16 +9,17 @@
 
 namespace espalier {
 
-/// While it lives, this thread rounds to nearest and keeps subnormal numbers; the caller's settings come back afterwards.
-/// Hosts such as Blender run threads that flush subnormals to zero, and then x != y no longer implies x - y != 0.
+/// While it lives, this thread rounds to nearest and keeps subnormal numbers; the caller's settings come back
+/// afterwards. Hosts such as Blender run threads that flush subnormals to zero, and then x != y no longer implies x - y
+/// != 0.
 class FloatEnvironment {
-   public:
+ public:
     FloatEnvironment() : saved_(read()) { write(kDefault); }
     ~FloatEnvironment() { write(saved_); }
     FloatEnvironment(const FloatEnvironment&) = delete;
     FloatEnvironment& operator=(const FloatEnvironment&) = delete;
 
-   private:
+ private:
 #if defined(__x86_64__)
     using Register = uint32_t;
     static constexpr Register kDefault = 0x1f80;  // all exceptions masked, round to nearest, no FTZ, no DAZ

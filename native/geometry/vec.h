@@ -54,9 +54,7 @@ bool is_finite(Vec3<T> a) {
     return std::isfinite(a.x) && std::isfinite(a.y) && std::isfinite(a.z);
 }
 
-constexpr Vec3d to_double(Vec3f a) {
-    return {a.x, a.y, a.z};
-}
+constexpr Vec3d to_double(Vec3f a) { return {a.x, a.y, a.z}; }
 
 /// Rounds each component once.
 constexpr Vec3f to_float(Vec3d a) {

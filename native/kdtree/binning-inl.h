@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// Min-max binning after Shevtsov, Soupikov and Kapustin 2007, section 4: counts of boxes that begin before and end behind each plane.
-// Compiled once per instruction set (see build_kernels.cpp).
+// Min-max binning after Shevtsov, Soupikov and Kapustin 2007, section 4: counts of boxes that begin before and end
+// behind each plane. Compiled once per instruction set (see build_kernels.cpp).
 
 #if defined(ESPALIER_KDTREE_BINNING_INL_H_) == defined(HWY_TARGET_TOGGLE)
 #ifdef ESPALIER_KDTREE_BINNING_INL_H_
@@ -35,7 +35,8 @@ inline float slice_position(float lower, float upper, int j, int slices) {
     if (j == 0) {
         return lower;
     }
-    return j == slices ? upper : lower + (upper - lower) * (static_cast<float>(j) * (1.0F / static_cast<float>(slices)));
+    return j == slices ? upper
+                       : lower + (upper - lower) * (static_cast<float>(j) * (1.0F / static_cast<float>(slices)));
 }
 
 /// A count that no node reaches, small enough for signed comparison.
@@ -48,10 +49,11 @@ struct Quantised {
     alignas(64) uint8_t end[kQuantisedChunk];
 };
 
-/// begin: the last slice that starts at or before the lower bound. end: the last slice that starts before the upper bound, and not before
-/// `begin`, so that a reference that lies in a plane counts behind it. Both at most `last`.
+/// begin: the last slice that starts at or before the lower bound. end: the last slice that starts before the upper
+/// bound, and not before `begin`, so that a reference that lies in a plane counts behind it. Both at most `last`.
 template <class D>
-HWY_INLINE void quantise(D df, const float* lower, const float* upper, Slices slices, int last, uint32_t count, Quantised& out) {
+HWY_INLINE void quantise(D df, const float* lower, const float* upper, Slices slices, int last, uint32_t count,
+                         Quantised& out) {
     const hn::RebindToSigned<D> di;
     const hn::Rebind<uint8_t, D> d8;
     const auto origin = hn::Set(df, slices.origin);
@@ -76,7 +78,8 @@ HWY_INLINE void count_below(const uint8_t* values, uint32_t count, int first_bou
     for (uint32_t i = 0; i < count; i += static_cast<uint32_t>(hn::Lanes(d))) {
         const auto v = hn::Load(d, reinterpret_cast<const int8_t*>(values) + i);
         for (int k = 0; k < kPlanes; ++k) {
-            below[k] += static_cast<uint32_t>(hn::CountTrue(d, hn::Lt(v, hn::Set(d, static_cast<int8_t>(first_bound + k)))));
+            below[k] +=
+                static_cast<uint32_t>(hn::CountTrue(d, hn::Lt(v, hn::Set(d, static_cast<int8_t>(first_bound + k)))));
         }
     }
     for (int k = 0; k < kPlanes; ++k) {
@@ -136,7 +139,8 @@ inline Split choose_split(const OpenNode& node, BinCounts& counts, const BuildPa
     }
     const int bins = parameters.bins;
     const SplitCosts costs(d, node, shape, parameters.sah);
-    const auto too_many = hn::Set(di, static_cast<int32_t>(std::min<uint64_t>(node.count + node.spare, kMostReferences) + 1));
+    const auto too_many =
+        hn::Set(di, static_cast<int32_t>(std::min<uint64_t>(node.count + node.spare, kMostReferences) + 1));
     CheapestPlane cheapest(d);
     for (int axis = 0; axis < 3; ++axis) {
         const float lower = node.tight.lower[axis];
@@ -155,7 +159,8 @@ inline Split choose_split(const OpenNode& node, BinCounts& counts, const BuildPa
             const auto left = hn::Load(du, counts.left[axis] + j);
             const auto right = hn::Load(du, counts.right[axis] + j);
             const auto cost = costs(axis, position, expected_blocks(d, left), expected_blocks(d, right));
-            const auto counts_as = hn::AndNot(hn::Gt(plane, last), hn::Lt(hn::BitCast(di, hn::Add(left, right)), too_many));
+            const auto counts_as =
+                hn::AndNot(hn::Gt(plane, last), hn::Lt(hn::BitCast(di, hn::Add(left, right)), too_many));
             cheapest.offer(axis * (bins + 1) + j, hn::IfThenElse(hn::RebindMask(d, counts_as), cost, hn::Inf(d)));
         }
     }

@@ -24,10 +24,17 @@ inline void make_reference(const TriangleSoup& soup, uint32_t triangle, const Re
     const Vec3f v1 = soup.vertex(triangle, 1);
     const Vec3f v2 = soup.vertex(triangle, 2);
     switch (classify_face(v0, v1, v2)) {
-        case FaceFault::kNotFinite: ++rejected.not_finite; return;
-        case FaceFault::kTooLarge: ++rejected.too_large; return;
-        case FaceFault::kNoArea: ++rejected.no_area; return;
-        case FaceFault::kNone: break;
+        case FaceFault::kNotFinite:
+            ++rejected.not_finite;
+            return;
+        case FaceFault::kTooLarge:
+            ++rejected.too_large;
+            return;
+        case FaceFault::kNoArea:
+            ++rejected.no_area;
+            return;
+        case FaceFault::kNone:
+            break;
     }
     for (size_t axis = 0; axis < 3; ++axis) {
         const int a = static_cast<int>(axis);
@@ -38,8 +45,8 @@ inline void make_reference(const TriangleSoup& soup, uint32_t triangle, const Re
     out.triangle[count++] = triangle;
 }
 
-inline uint32_t make_references(const TriangleSoup& soup, uint32_t begin, uint32_t end, const References& out, Box3f& bounds,
-                                RejectedFaces& rejected) {
+inline uint32_t make_references(const TriangleSoup& soup, uint32_t begin, uint32_t end, const References& out,
+                                Box3f& bounds, RejectedFaces& rejected) {
     const hn::ScalableTag<float> df;
     const hn::RebindToSigned<decltype(df)> di;
     const hn::RebindToUnsigned<decltype(df)> du;

@@ -19,9 +19,10 @@
 HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
 
-/// Splits one node after the other, depth first. Left children stay where their parent's references lay, right ones wait behind.
+/// Splits one node after the other, depth first. Left children stay where their parent's references lay, right ones
+/// wait behind.
 class SubtreeBuilder {
-   public:
+ public:
     SubtreeBuilder(const SubtreeInput& input, SubtreeOutput& output) : input_(input), output_(output) {}
 
     /// Builds below a node whose references begin at `begin`; from `room` on there is space for right children.
@@ -49,7 +50,8 @@ class SubtreeBuilder {
                 build_elsewhere(node, references);
                 return;
             }
-            parts = partition(*input_.soup, references, node.count, split, input_.parameters->clip, references, at(room));
+            parts =
+                partition(*input_.soup, references, node.count, split, input_.parameters->clip, references, at(room));
             right_begin = room;
             right_room = room + parts.right_count;
         }
@@ -74,7 +76,7 @@ class SubtreeBuilder {
         output_.boxes[index] = box;
     }
 
-   private:
+ private:
     References at(size_t place) const { return input_.references->references().at(place); }
 
     /// For scenes whose every plane leaves nearly all references on one side, or on both.
@@ -112,11 +114,15 @@ namespace espalier {
 const BuildKernels& build_kernels() {
     switch (simd_target()) {
 #if defined(__x86_64__)
-        case HWY_AVX3_DL: return N_AVX3_DL::kKernels;
-        case HWY_AVX2: return N_AVX2::kKernels;
-        default: return N_SSE4::kKernels;
+        case HWY_AVX3_DL:
+            return N_AVX3_DL::kKernels;
+        case HWY_AVX2:
+            return N_AVX2::kKernels;
+        default:
+            return N_SSE4::kKernels;
 #else
-        default: return N_NEON::kKernels;
+        default:
+            return N_NEON::kKernels;
 #endif
     }
 }

@@ -30,8 +30,8 @@ struct OpenNode {
     int depth;
 };
 
-/// References that begin before plane j, and that end behind it, per axis, for the planes between bins. Counts add up over parts of a
-/// node. There is room for both ends of the node's tight box, and for vector code to read on.
+/// References that begin before plane j, and that end behind it, per axis, for the planes between bins. Counts add up
+/// over parts of a node. There is room for both ends of the node's tight box, and for vector code to read on.
 struct BinCounts {
     alignas(64) uint32_t left[3][kMaxBins + 16];
     alignas(64) uint32_t right[3][kMaxBins + 16];
@@ -64,19 +64,20 @@ struct SubtreeInput {
     const ReferenceBuffer* references;  ///< the node's own, at the start; behind them is room for right children
 };
 
-/// Room for a subtree's references, and for the right children that wait while left ones are built: rarely more than as many again.
-inline size_t subtree_room(uint32_t count) {
-    return size_t{2} * count + count / 4 + 1024;
-}
+/// Room for a subtree's references, and for the right children that wait while left ones are built: rarely more than as
+/// many again.
+inline size_t subtree_room(uint32_t count) { return size_t{2} * count + count / 4 + 1024; }
 
 /// The inner loops of the builder, compiled once for each instruction set. All give the same tree bit for bit.
 struct BuildKernels {
-    /// Writes a reference for each valid face of [begin, end) to `out`; returns how many, extends `bounds`, counts the others.
-    uint32_t (*make_references)(const TriangleSoup& soup, uint32_t begin, uint32_t end, const References& out, Box3f& bounds,
-                                RejectedFaces& rejected);
+    /// Writes a reference for each valid face of [begin, end) to `out`; returns how many, extends `bounds`, counts the
+    /// others.
+    uint32_t (*make_references)(const TriangleSoup& soup, uint32_t begin, uint32_t end, const References& out,
+                                Box3f& bounds, RejectedFaces& rejected);
     /// Adds part of a node's references to its counts.
     void (*count_bins)(const References& references, uint32_t count, const Box3f& tight, int bins, BinCounts& counts);
-    /// The plane of least cost by the surface area heuristic, or a leaf. Fills in the counts at the ends of the tight box.
+    /// The plane of least cost by the surface area heuristic, or a leaf. Fills in the counts at the ends of the tight
+    /// box.
     Split (*choose_split)(const OpenNode& node, BinCounts& counts, const BuildParameters& parameters);
     /// Sorts references by side, in order; those on both sides go to both. `left` may be `in` itself.
     Partition (*partition)(const TriangleSoup& soup, const References& in, uint32_t count, Split split, bool clip,
@@ -113,7 +114,8 @@ inline bool cuts_empty_space(const OpenNode& node, Split split, Partition& parts
 }
 
 /// The two nodes that a split makes of one.
-inline void open_children(const OpenNode& parent, Split split, const Partition& parts, OpenNode& left, OpenNode& right) {
+inline void open_children(const OpenNode& parent, Split split, const Partition& parts, OpenNode& left,
+                          OpenNode& right) {
     left = {parent.cell, parts.left_tight, parts.left_count, 0, parent.depth + 1};
     right = {parent.cell, parts.right_tight, parts.right_count, 0, parent.depth + 1};
     left.cell.upper[split.axis] = split.position;

@@ -17,7 +17,7 @@ namespace {
 constexpr uint32_t kMaxTriangles = 1U << 28;
 
 class Stopwatch {
-   public:
+ public:
     /// Milliseconds since the last lap.
     double lap() {
         const auto now = std::chrono::steady_clock::now();
@@ -26,7 +26,7 @@ class Stopwatch {
         return ms;
     }
 
-   private:
+ private:
     std::chrono::steady_clock::time_point last_ = std::chrono::steady_clock::now();
 };
 
@@ -37,8 +37,11 @@ BuildParameters parameters_of(Quality quality) {
             parameters.clip = false;
             parameters.sah.block = 8.0;
             break;
-        case Quality::kBalanced: break;
-        case Quality::kBest: parameters.bins = 32; break;
+        case Quality::kBalanced:
+            break;
+        case Quality::kBest:
+            parameters.bins = 32;
+            break;
     }
     return parameters;
 }
@@ -58,7 +61,7 @@ struct Subtree {
 
 /// The phases of a build, in order.
 class Builder {
-   public:
+ public:
     Builder(const TriangleSoup& soup, const BuildOptions& options)
         : soup_(soup),
           cancel_(options.cancel),
@@ -99,13 +102,13 @@ class Builder {
     int threads() const { return threads_; }
     const BuildParameters& parameters() const { return parameters_; }
 
-   private:
+ private:
     /// One thread needs no top levels: all references in one piece, and one subtree.
     void make_references_alone() {
         const uint32_t triangles = soup_.size();
         rooms_[0] = ReferenceBuffer(subtree_room(triangles));
-        const uint32_t count = build_kernels().make_references(soup_, 0, triangles, rooms_[0].references(), tree_.bounds,
-                                                               tree_.report.rejected_faces);
+        const uint32_t count = build_kernels().make_references(soup_, 0, triangles, rooms_[0].references(),
+                                                               tree_.bounds, tree_.report.rejected_faces);
         whole_ = {tree_.bounds, tree_.bounds, count, spare_references(triangles), 0};
         subtrees_.push_back({&whole_, nullptr});
     }
@@ -197,14 +200,14 @@ class Builder {
         const auto block_shift = subtree.block_place - static_cast<uint32_t>(subtree.first_triangle / kBlockSize);
         for (size_t i = 0; i < subtree.node_count; ++i) {
             const KdNode node = output.nodes[subtree.first_node + i];
-            tree_.nodes[subtree.place + i] = node.is_leaf()
-                                                 ? KdNode::leaf(node.first_block() + block_shift, node.references())
-                                                 : KdNode::inner(node.axis(), node.split(), node.right_child() + node_shift);
+            tree_.nodes[subtree.place + i] =
+                node.is_leaf() ? KdNode::leaf(node.first_block() + block_shift, node.references())
+                               : KdNode::inner(node.axis(), node.split(), node.right_child() + node_shift);
         }
         std::copy_n(output.boxes.begin() + static_cast<std::ptrdiff_t>(subtree.first_node), subtree.node_count,
                     boxes_.data() + subtree.place);
-        std::copy_n(output.triangles.begin() + static_cast<std::ptrdiff_t>(subtree.first_triangle), subtree.triangle_count,
-                    triangles_.data() + size_t{subtree.block_place} * kBlockSize);
+        std::copy_n(output.triangles.begin() + static_cast<std::ptrdiff_t>(subtree.first_triangle),
+                    subtree.triangle_count, triangles_.data() + size_t{subtree.block_place} * kBlockSize);
     }
 
     void write_top(uint32_t index, const std::vector<uint32_t>& top_places) {
@@ -237,7 +240,7 @@ class Builder {
     std::optional<TopLevels> top_;
     OpenNode whole_{};
     std::vector<Subtree> subtrees_;
-    std::vector<Subtree*> subtree_of_;  ///< per top node; null where the node is split
+    std::vector<Subtree*> subtree_of_;    ///< per top node; null where the node is split
     std::vector<SubtreeOutput> outputs_;  ///< per thread
     std::vector<ReferenceBuffer> rooms_;  ///< per thread
     LargeBuffer<Box3f> boxes_;            ///< tight, per node

@@ -11,19 +11,20 @@
 
 namespace espalier {
 
-/// Room for `capacity` items straight from the operating system, in huge pages where that pays. Memory is taken only when it is first
-/// written. Items start as zero bytes.
+/// Room for `capacity` items straight from the operating system, in huge pages where that pays. Memory is taken only
+/// when it is first written. Items start as zero bytes.
 template <class T>
 class LargeBuffer {
     static_assert(std::is_trivially_copyable_v<T>);
 
-   public:
+ public:
     LargeBuffer() = default;
     explicit LargeBuffer(size_t capacity) : capacity_(capacity) {
         if (capacity == 0) {
             return;
         }
-        void* memory = ::mmap(nullptr, bytes(), PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);
+        void* memory =
+            ::mmap(nullptr, bytes(), PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);
         if (memory == MAP_FAILED) {
             throw std::bad_alloc();
         }
@@ -53,8 +54,9 @@ class LargeBuffer {
     const T& operator[](size_t i) const { return data_[i]; }
     std::span<const T> span() const { return {data_, capacity_}; }
 
-   private:
-    static constexpr size_t kHugePagesFrom = size_t{4} << 20;  ///< below, clearing the rest of the last page costs more than it saves
+ private:
+    static constexpr size_t kHugePagesFrom =
+        size_t{4} << 20;  ///< below, clearing the rest of the last page costs more than it saves
     T* data_ = nullptr;
     size_t capacity_ = 0;
 };

@@ -12,8 +12,8 @@
 namespace espalier {
 namespace {
 
-/// A run of kd nodes that forms one subtree, laid out by one thread. Where the tree is cut into such runs depends on the tree
-/// alone, so that the layout is the same for any number of threads.
+/// A run of kd nodes that forms one subtree, laid out by one thread. Where the tree is cut into such runs depends on
+/// the tree alone, so that the layout is the same for any number of threads.
 struct Run {
     uint32_t begin;
     uint32_t end;
@@ -23,9 +23,7 @@ struct Run {
     uint32_t first_wide = 0;
 };
 
-uint32_t run_length(size_t nodes) {
-    return static_cast<uint32_t>(std::max<size_t>(512, nodes / 256));
-}
+uint32_t run_length(size_t nodes) { return static_cast<uint32_t>(std::max<size_t>(512, nodes / 256)); }
 
 /// Something that may become a child of a wide node: a kd node, or part of a kd leaf too large for one child.
 struct Item {
@@ -37,16 +35,16 @@ struct Item {
 };
 
 class Collapse {
-   public:
+ public:
     Collapse(const Tree& tree, const LargeBuffer<Box3f>& boxes) : tree_(tree), boxes_(boxes) {}
 
-    /// Appends the wide node for a kd node and all below it; returns its index. A kd node listed in `runs` is not entered: its child code
-    /// is the index of its run, marked for the caller to resolve.
+    /// Appends the wide node for a kd node and all below it; returns its index. A kd node listed in `runs` is not
+    /// entered: its child code is the index of its run, marked for the caller to resolve.
     uint32_t collapse(uint32_t kd_node, std::vector<WideNode>& out, const std::vector<Run>* runs) const {
         return collapse(item(kd_node), out, runs);
     }
 
-   private:
+ private:
     Item item(uint32_t node) const {
         const KdNode kd = tree_.nodes[node];
         const Box3f& box = boxes_[node];
@@ -59,13 +57,16 @@ class Collapse {
         return made;
     }
 
-    static bool is_empty(const Tree& tree, uint32_t node) { return tree.nodes[node].is_leaf() && tree.nodes[node].references() == 0; }
+    static bool is_empty(const Tree& tree, uint32_t node) {
+        return tree.nodes[node].is_leaf() && tree.nodes[node].references() == 0;
+    }
 
     static const Run* find_run(const std::vector<Run>* runs, uint32_t node) {
         if (runs == nullptr) {
             return nullptr;
         }
-        const auto found = std::lower_bound(runs->begin(), runs->end(), node, [](const Run& run, uint32_t n) { return run.begin < n; });
+        const auto found = std::lower_bound(runs->begin(), runs->end(), node,
+                                            [](const Run& run, uint32_t n) { return run.begin < n; });
         return found != runs->end() && found->begin == node ? &*found : nullptr;
     }
 
@@ -120,14 +121,16 @@ class Collapse {
     }
 
     /// The child of largest area that can be opened, or -1.
-    static int next_to_open(const std::array<Item, WideNode::kWidth>& items, int count, uint32_t root, const std::vector<Run>* runs) {
+    static int next_to_open(const std::array<Item, WideNode::kWidth>& items, int count, uint32_t root,
+                            const std::vector<Run>* runs) {
         if (count == WideNode::kWidth) {
             return -1;
         }
         int best = -1;
         for (int i = 0; i < count; ++i) {
             const Item& candidate = items[static_cast<size_t>(i)];
-            const bool is_inner = candidate.blocks == 0 && (candidate.node == root || find_run(runs, candidate.node) == nullptr);
+            const bool is_inner =
+                candidate.blocks == 0 && (candidate.node == root || find_run(runs, candidate.node) == nullptr);
             const bool is_long_leaf = candidate.blocks > WideNode::kMaxLeafBlocks;
             if ((is_inner || is_long_leaf) && (best < 0 || candidate.area > items[static_cast<size_t>(best)].area)) {
                 best = i;
@@ -196,8 +199,8 @@ void find_runs(const Tree& tree, uint32_t begin, uint32_t end, uint32_t longest,
 
 }  // namespace
 
-void build_layout(const TriangleSoup& soup, const LargeBuffer<Box3f>& boxes, const LargeBuffer<uint32_t>& triangles, int threads,
-                  Tree& tree) {
+void build_layout(const TriangleSoup& soup, const LargeBuffer<Box3f>& boxes, const LargeBuffer<uint32_t>& triangles,
+                  int threads, Tree& tree) {
     constexpr size_t kBlocksPerTask = 512;
     const size_t blocks = triangles.size() / kBlockSize;
     tree.blocks = LargeBuffer<TriangleBlock>(blocks);

@@ -5,10 +5,10 @@
 
 namespace espalier {
 
-/// Phase 5: derives from the finished kd-tree what rays walk through: triangle blocks, and eight-wide nodes collapsed from the
-/// tree's nodes, each child with its tight box, in the order that the split planes give for each ray octant.
+/// Phase 5: derives from the finished kd-tree what rays walk through: triangle blocks, and eight-wide nodes collapsed
+/// from the tree's nodes, each child with its tight box, in the order that the split planes give for each ray octant.
 /// boxes: tight, per kd node. triangles: kBlockSize face indices per block, padded with kNoTriangle.
-void build_layout(const TriangleSoup& soup, const LargeBuffer<Box3f>& boxes, const LargeBuffer<uint32_t>& triangles, int threads,
-                  Tree& tree);
+void build_layout(const TriangleSoup& soup, const LargeBuffer<Box3f>& boxes, const LargeBuffer<uint32_t>& triangles,
+                  int threads, Tree& tree);
 
 }  // namespace espalier

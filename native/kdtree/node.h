@@ -10,13 +10,11 @@ namespace espalier {
 constexpr uint32_t kBlockSize = 8;
 
 /// Blocks that hold `references` triangles.
-constexpr uint32_t block_count(uint32_t references) {
-    return (references + kBlockSize - 1) / kBlockSize;
-}
+constexpr uint32_t block_count(uint32_t references) { return (references + kBlockSize - 1) / kBlockSize; }
 
 /// A kd-tree node in 8 bytes, as in pbrt. Nodes lie depth first: the left child right behind its parent.
 class KdNode {
-   public:
+ public:
     static KdNode inner(int axis, float split, uint32_t right_child) {
         return {std::bit_cast<uint32_t>(split), (right_child << 2) | static_cast<uint32_t>(axis)};
     }
@@ -30,7 +28,7 @@ class KdNode {
     uint32_t references() const { return tag_ >> 2; }
     uint64_t bits() const { return (static_cast<uint64_t>(tag_) << 32) | value_; }
 
-   private:
+ private:
     static constexpr uint32_t kLeaf = 3;
     KdNode(uint32_t value, uint32_t tag) : value_(value), tag_(tag) {}
     uint32_t value_;
@@ -56,7 +54,8 @@ struct alignas(64) WideNode {
     float lower[3][kWidth];  ///< unused lanes hold an inverted box, which no ray meets
     float upper[3][kWidth];
     uint32_t child[kWidth];  ///< index of a wide node, or leaf(first_block, blocks)
-    uint32_t order[8];       ///< per ray octant (bit a: direction[a] < 0): eight ranks of 3 bits, the nearest child in the highest
+    uint32_t order[8];  ///< per ray octant (bit a: direction[a] < 0): eight ranks of 3 bits, the nearest child in the
+                        ///< highest
 
     static constexpr uint32_t leaf(uint32_t first_block, uint32_t blocks) {
         return kLeafFlag | (first_block << 5) | (blocks - 1);

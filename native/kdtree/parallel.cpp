@@ -43,7 +43,7 @@ struct alignas(64) Worker {
 };
 
 class Pool {
-   public:
+ public:
     void run(int threads, void (*body)(void*, int), void* context) {
         const std::lock_guard lock(mutex_);  // jobs of several callers take turns
         grow(threads - 1);
@@ -62,7 +62,7 @@ class Pool {
         }
     }
 
-   private:
+ private:
     void grow(int count) {
         while (workers_.size() < static_cast<size_t>(count)) {
             const int index = static_cast<int>(workers_.size()) + 1;
@@ -87,7 +87,7 @@ class Pool {
     std::vector<std::unique_ptr<Worker>> workers_;
     std::atomic<int> remaining_{0};
 
-   public:
+ public:
     static thread_local bool is_worker;  ///< this thread already runs a body: what it starts, it runs alone
 };
 
@@ -99,7 +99,7 @@ Pool& pool() {
     static Pool* instance = nullptr;
     static pid_t owner = 0;
     const std::lock_guard lock(mutex);
-    if (owner != ::getpid()) {
+    if (instance == nullptr || owner != ::getpid()) {
         instance = new Pool;
         owner = ::getpid();
     }

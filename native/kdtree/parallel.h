@@ -13,12 +13,14 @@ namespace espalier {
 /// Threads this process may run on at the same time, at least 1.
 int hardware_threads();
 
-/// Runs body(context, worker) once for each worker in [0, threads), worker 0 being the calling thread, and returns when all have ended.
-/// The threads are kept for the next call. A call made from inside a body runs on the calling thread alone.
+/// Runs body(context, worker) once for each worker in [0, threads), worker 0 being the calling thread, and returns when
+/// all have ended. The threads are kept for the next call. A call made from inside a body runs on the calling thread
+/// alone.
 void run_on_threads(int threads, void (*body)(void* context, int worker), void* context);
 
-/// Calls f(i) or f(i, worker) for each i in [0, count) on at most `threads` threads, the calling one included; worker is in [0, threads).
-/// Indices are handed out in order, one at a time, so put the largest work first. The first exception thrown is thrown again here.
+/// Calls f(i) or f(i, worker) for each i in [0, count) on at most `threads` threads, the calling one included; worker
+/// is in [0, threads). Indices are handed out in order, one at a time, so put the largest work first. The first
+/// exception thrown is thrown again here.
 template <class F>
 void parallel_for(int threads, size_t count, const F& f) {
     struct Context {

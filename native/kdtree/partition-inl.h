@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// Stable partition of a node's references by a split plane, with split clipping (Soupikov, Shevtsov and Kapustin 2008) of those that
-// straddle it. Compiled once per instruction set (see build_kernels.cpp).
+// Stable partition of a node's references by a split plane, with split clipping (Soupikov, Shevtsov and Kapustin 2008)
+// of those that straddle it. Compiled once per instruction set (see build_kernels.cpp).
 
 #if defined(ESPALIER_KDTREE_PARTITION_INL_H_) == defined(HWY_TARGET_TOGGLE)
 #ifdef ESPALIER_KDTREE_PARTITION_INL_H_
@@ -26,7 +26,7 @@ class BoxUnion {
     using V = hn::Vec<D>;
     using M = hn::Mask<D>;
 
-   public:
+ public:
     explicit HWY_INLINE BoxUnion(D d) : d_(d) {
         for (int axis = 0; axis < 3; ++axis) {
             lower_[axis] = hn::Inf(d);
@@ -46,7 +46,7 @@ class BoxUnion {
         return box;
     }
 
-   private:
+ private:
     D d_;
     V lower_[3];
     V upper_[3];
@@ -67,24 +67,27 @@ struct DroppedHalves {
     std::vector<uint32_t> right;
 };
 
-/// Where the edge p-q crosses the plane, on another axis: the true crossing lies in [low, high]. With u = 2^-24, t = (s - p) / (q - p) is off
-/// by a factor within 1 +- 3.01 u, the product with the edge by two more roundings, and the sum by one of the result: below 5.1 u |edge| +
-/// 1.01 u |crossing|, of which the margin takes more than the double; its last term covers underflow.
+/// Where the edge p-q crosses the plane, on another axis: the true crossing lies in [low, high]. With u = 2^-24, t = (s
+/// - p) / (q - p) is off by a factor within 1 +- 3.01 u, the product with the edge by two more roundings, and the sum
+/// by one of the result: below 5.1 u |edge| + 1.01 u |crossing|, of which the margin takes more than the double; its
+/// last term covers underflow.
 template <class D, class V = hn::Vec<D>>
 HWY_INLINE void cross_plane(D d, V t, V p, V q, V& low, V& high) {
     const V edge = hn::Sub(q, p);
     const V crossing = hn::Add(p, hn::Mul(t, edge));
-    const V margin = hn::Add(hn::Add(hn::Mul(hn::Abs(edge), hn::Set(d, 0x1p-20F)), hn::Mul(hn::Abs(crossing), hn::Set(d, 0x1p-22F))),
-                             hn::Set(d, 0x1p-120F));
+    const V margin =
+        hn::Add(hn::Add(hn::Mul(hn::Abs(edge), hn::Set(d, 0x1p-20F)), hn::Mul(hn::Abs(crossing), hn::Set(d, 0x1p-22F))),
+                hn::Set(d, 0x1p-120F));
     low = hn::Sub(crossing, margin);
     high = hn::Add(crossing, margin);
 }
 
-/// Cuts the boxes of both halves of each straddler to what the triangle has on that side of the plane. Every box stays a bound of
-/// triangle, node and half-space together, so a half whose box is empty can go.
+/// Cuts the boxes of both halves of each straddler to what the triangle has on that side of the plane. Every box stays
+/// a bound of triangle, node and half-space together, so a half whose box is empty can go.
 template <class D>
-HWY_INLINE void clip_straddlers(D d, const TriangleSoup& soup, Split split, const References& left, const References& right,
-                                Straddlers& straddlers, BoxUnion<D>& left_tight, BoxUnion<D>& right_tight, DroppedHalves& dropped) {
+HWY_INLINE void clip_straddlers(D d, const TriangleSoup& soup, Split split, const References& left,
+                                const References& right, Straddlers& straddlers, BoxUnion<D>& left_tight,
+                                BoxUnion<D>& right_tight, DroppedHalves& dropped) {
     using V = hn::Vec<D>;
     const hn::RebindToSigned<D> di;
     const auto lanes = static_cast<uint32_t>(hn::Lanes(d));
@@ -105,7 +108,8 @@ HWY_INLINE void clip_straddlers(D d, const TriangleSoup& soup, Split split, cons
         const auto corner0 = hn::Add(triangle, hn::Add(triangle, triangle));
         V v[3][3];
         for (int k = 0; k < 3; ++k) {
-            const auto vertex = hn::GatherIndex(di, reinterpret_cast<const int32_t*>(soup.triangles.data()) + k, corner0);
+            const auto vertex =
+                hn::GatherIndex(di, reinterpret_cast<const int32_t*>(soup.triangles.data()) + k, corner0);
             const auto index = hn::Add(vertex, hn::Add(vertex, vertex));
             for (int axis = 0; axis < 3; ++axis) {
                 v[k][axis] = hn::GatherIndex(d, soup.positions.data() + axis, index);
@@ -121,7 +125,8 @@ HWY_INLINE void clip_straddlers(D d, const TriangleSoup& soup, Split split, cons
         }
         for (int k = 0; k < 3; ++k) {
             const int next = (k + 1) % 3;
-            crosses[k] = hn::Or(hn::AndNot(on_right[k], hn::Not(on_left[next])), hn::AndNot(on_left[k], hn::Not(on_right[next])));
+            crosses[k] = hn::Or(hn::AndNot(on_right[k], hn::Not(on_left[next])),
+                                hn::AndNot(on_left[k], hn::Not(on_right[next])));
             t[k] = hn::Div(hn::Sub(plane, v[k][a]), hn::Sub(v[next][a], v[k][a]));
         }
         const auto stored = hn::FirstN(d, active);
@@ -144,7 +149,8 @@ HWY_INLINE void clip_straddlers(D d, const TriangleSoup& soup, Split split, cons
                 left_low = hn::Min(left_low, hn::Min(low, hn::IfThenElse(on_left[k], v[k][b], hn::Inf(d))));
                 right_low = hn::Min(right_low, hn::Min(low, hn::IfThenElse(on_right[k], v[k][b], hn::Inf(d))));
                 left_high = hn::Max(left_high, hn::Max(high, hn::IfThenElse(on_left[k], v[k][b], hn::Neg(hn::Inf(d)))));
-                right_high = hn::Max(right_high, hn::Max(high, hn::IfThenElse(on_right[k], v[k][b], hn::Neg(hn::Inf(d)))));
+                right_high =
+                    hn::Max(right_high, hn::Max(high, hn::IfThenElse(on_right[k], v[k][b], hn::Neg(hn::Inf(d)))));
             }
             const V lower = hn::GatherIndex(d, left.lower[bi], at_left);
             const V upper = hn::GatherIndex(d, left.upper[bi], at_left);
@@ -198,7 +204,8 @@ HWY_INLINE void clip_straddlers(D d, const TriangleSoup& soup, Split split, cons
 }
 
 /// Closes the gaps at the given positions; returns how many references are left.
-inline uint32_t remove_references(const References& references, uint32_t count, const std::vector<uint32_t>& positions) {
+inline uint32_t remove_references(const References& references, uint32_t count,
+                                  const std::vector<uint32_t>& positions) {
     const auto close_gaps = [&](auto* values) {
         uint32_t to = positions.front();
         for (size_t i = 0; i < positions.size(); ++i) {
@@ -225,8 +232,8 @@ HWY_INLINE uint64_t mask_bits(D d, hn::Mask<D> mask) {
     return bits;
 }
 
-inline Partition partition(const TriangleSoup& soup, const References& in, uint32_t count, Split split, bool clip, const References& left,
-                           const References& right) {
+inline Partition partition(const TriangleSoup& soup, const References& in, uint32_t count, Split split, bool clip,
+                           const References& left, const References& right) {
     const hn::ScalableTag<float> d;
     const hn::RebindToUnsigned<decltype(d)> du;
     const auto lanes = static_cast<uint32_t>(hn::Lanes(d));
@@ -244,7 +251,8 @@ inline Partition partition(const TriangleSoup& soup, const References& in, uint3
         const auto begins_before = hn::Lt(hn::LoadU(d, in.lower[a] + i), plane);
         const auto to_left = hn::And(valid, begins_before);
         // What lies in the plane goes right.
-        const auto to_right = hn::And(valid, hn::Or(hn::Not(begins_before), hn::Gt(hn::LoadU(d, in.upper[a] + i), plane)));
+        const auto to_right =
+            hn::And(valid, hn::Or(hn::Not(begins_before), hn::Gt(hn::LoadU(d, in.upper[a] + i), plane)));
         const auto to_both = hn::And(to_left, to_right);
         const auto tight_left = clip ? hn::AndNot(to_both, to_left) : to_left;
         const auto tight_right = clip ? hn::AndNot(to_both, to_right) : to_right;
@@ -270,8 +278,10 @@ inline Partition partition(const TriangleSoup& soup, const References& in, uint3
         if (clip) {
             for (uint64_t both = left_bits & right_bits; both != 0; both &= both - 1) {
                 const uint64_t earlier = (both & -both) - 1;
-                straddlers.left[straddlers.count] = left_count + static_cast<uint32_t>(std::popcount(left_bits & earlier));
-                straddlers.right[straddlers.count] = right_count + static_cast<uint32_t>(std::popcount(right_bits & earlier));
+                straddlers.left[straddlers.count] =
+                    left_count + static_cast<uint32_t>(std::popcount(left_bits & earlier));
+                straddlers.right[straddlers.count] =
+                    right_count + static_cast<uint32_t>(std::popcount(right_bits & earlier));
                 ++straddlers.count;
             }
         }

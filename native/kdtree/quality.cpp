@@ -30,7 +30,7 @@ double add_cost(const Tree& tree, uint32_t index, const Box3f& cell, BuildReport
 
 /// FNV-1a over 64-bit words, mixed as in splitmix64.
 class Checksum {
-   public:
+ public:
     void add(uint64_t word) {
         state_ = (state_ ^ word) * 0x9e3779b97f4a7c15U;
         state_ ^= state_ >> 32;
@@ -48,7 +48,7 @@ class Checksum {
     }
     uint64_t value() const { return state_; }
 
-   private:
+ private:
     uint64_t state_ = 0xcbf29ce484222325U;
 };
 

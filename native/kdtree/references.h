@@ -11,8 +11,8 @@
 
 namespace espalier {
 
-/// References to triangles, as structure of arrays: the box of the part of each triangle that lies in the node, and its index.
-/// Vector code may write up to kSlack items past the end.
+/// References to triangles, as structure of arrays: the box of the part of each triangle that lies in the node, and its
+/// index. Vector code may write up to kSlack items past the end.
 struct References {
     std::array<float*, 3> lower{};
     std::array<float*, 3> upper{};
@@ -43,7 +43,7 @@ inline void copy_references(const References& from, size_t count, const Referenc
 
 /// Memory for references. Pages are taken when they are first written.
 class ReferenceBuffer {
-   public:
+ public:
     static constexpr size_t kArrays = 7;
     static constexpr size_t kSlack = 64;
 
@@ -59,7 +59,7 @@ class ReferenceBuffer {
     const References& references() const { return references_; }
     size_t capacity() const { return stride_ - kSlack; }
 
-   private:
+ private:
     size_t stride_ = 0;  ///< not a multiple of a page, so that the arrays do not compete for the same cache sets
     LargeBuffer<uint32_t> memory_;
     References references_;

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// The surface area heuristic, a vector of planes at a time: a step through an inner node against blocks of eight triangle tests.
-// Compiled once per instruction set (see build_kernels.cpp).
+// The surface area heuristic, a vector of planes at a time: a step through an inner node against blocks of eight
+// triangle tests. Compiled once per instruction set (see build_kernels.cpp).
 
 #if defined(ESPALIER_KDTREE_SAH_INL_H_) == defined(HWY_TARGET_TOGGLE)
 #ifdef ESPALIER_KDTREE_SAH_INL_H_
@@ -41,7 +41,7 @@ template <class D>
 class SplitCosts {
     using V = hn::Vec<D>;
 
-   public:
+ public:
     HWY_INLINE SplitCosts(D d, const OpenNode& node, const CellShape& shape, const SahConstants& sah)
         : d_(d),
           cell_(node.cell),
@@ -54,23 +54,25 @@ class SplitCosts {
     HWY_INLINE V relative_area(int axis, V extent) const {
         const float b = shape_.side[(axis + 1) % 3];
         const float c = shape_.side[(axis + 2) % 3];
-        return hn::Mul(hn::Add(hn::Set(d_, b * c), hn::Mul(hn::Mul(extent, hn::Set(d_, shape_.scale)), hn::Set(d_, b + c))),
-                       hn::Set(d_, shape_.inverse_area));
+        return hn::Mul(
+            hn::Add(hn::Set(d_, b * c), hn::Mul(hn::Mul(extent, hn::Set(d_, shape_.scale)), hn::Set(d_, b + c))),
+            hn::Set(d_, shape_.inverse_area));
     }
 
     /// Cost of planes with so many blocks on either side, per ray that meets the cell; infinite outside the cell.
     HWY_INLINE V operator()(int axis, V position, V left_blocks, V right_blocks) const {
         const V lower = hn::Set(d_, cell_.lower[axis]);
         const V upper = hn::Set(d_, cell_.upper[axis]);
-        const V children = hn::Mul(hn::Set(d_, block_), hn::Add(hn::Mul(relative_area(axis, hn::Sub(position, lower)), left_blocks),
-                                                                hn::Mul(relative_area(axis, hn::Sub(upper, position)), right_blocks)));
+        const V children =
+            hn::Mul(hn::Set(d_, block_), hn::Add(hn::Mul(relative_area(axis, hn::Sub(position, lower)), left_blocks),
+                                                 hn::Mul(relative_area(axis, hn::Sub(upper, position)), right_blocks)));
         const auto one_is_empty = hn::Eq(hn::Min(left_blocks, right_blocks), hn::Zero(d_));
         const V cost = hn::Add(hn::Set(d_, traversal_),
                                hn::IfThenElse(one_is_empty, hn::Mul(children, hn::Set(d_, bonus_)), children));
         return hn::IfThenElse(hn::And(hn::Lt(lower, position), hn::Lt(position, upper)), cost, hn::Inf(d_));
     }
 
-   private:
+ private:
     D d_;
     const Box3f& cell_;
     const CellShape& shape_;
@@ -84,7 +86,7 @@ template <class D>
 class CheapestPlane {
     using DI = hn::RebindToSigned<D>;
 
-   public:
+ public:
     HWY_INLINE explicit CheapestPlane(D d) : d_(d), cost_(hn::Inf(d)), index_(hn::Zero(DI())) {}
 
     HWY_INLINE void offer(int first_index, hn::Vec<D> cost) {
@@ -99,7 +101,7 @@ class CheapestPlane {
         return hn::GetLane(hn::MinOfLanes(DI(), hn::IfThenElse(hn::RebindMask(DI(), is_least), index_, last)));
     }
 
-   private:
+ private:
     D d_;
     hn::Vec<D> cost_;
     hn::Vec<DI> index_;

@@ -18,7 +18,8 @@ std::vector<NamedTarget> runnable_targets() {
     std::vector<NamedTarget> targets;
 #if defined(__x86_64__)
     __builtin_cpu_init();
-    // Ice Lake's set and later, among them all of Zen 4 and 5: vector population counts are what the builder wants most.
+    // Ice Lake's set and later, among them all of Zen 4 and 5: vector population counts are what the builder wants
+    // most.
     if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512dq") &&
         __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512cd") &&
         __builtin_cpu_supports("avx512vpopcntdq") && __builtin_cpu_supports("avx512bitalg") &&

@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// The last references of a subtree, as one 64-bit mask: each candidate plane has a mask of the references to its left and one of those
-// to its right, so that counts are population counts and children are intersections, and no reference is moved again. After the small
-// nodes of Zhou, Hou, Wang and Guo 2008, section 3.3. Compiled once per instruction set (see build_kernels.cpp).
+// The last references of a subtree, as one 64-bit mask: each candidate plane has a mask of the references to its left
+// and one of those to its right, so that counts are population counts and children are intersections, and no reference
+// is moved again. After the small nodes of Zhou, Hou, Wang and Guo 2008, section 3.3. Compiled once per instruction set
+// (see build_kernels.cpp).
 
 #if defined(ESPALIER_KDTREE_SMALL_NODE_INL_H_) == defined(HWY_TARGET_TOGGLE)
 #ifdef ESPALIER_KDTREE_SMALL_NODE_INL_H_
@@ -24,7 +25,7 @@ namespace hn = hwy::HWY_NAMESPACE;
 
 /// Appends a leaf with these triangles.
 class LeafWriter {
-   public:
+ public:
     explicit LeafWriter(SubtreeOutput& output, uint32_t references) : output_(output) {
         const auto first = static_cast<uint32_t>(output.triangles.size());
         output.nodes.push_back(KdNode::leaf(first / kBlockSize, references));
@@ -34,14 +35,15 @@ class LeafWriter {
     void add(uint32_t triangle) { *next_++ = triangle; }
     void finish(const Box3f& box) { output_.boxes.push_back(box); }
 
-   private:
+ private:
     SubtreeOutput& output_;
     uint32_t* next_;
 };
 
 class SmallNode {
-   public:
-    HWY_INLINE SmallNode(const References& references, const OpenNode& node, const BuildParameters& parameters, SubtreeOutput& output)
+ public:
+    HWY_INLINE SmallNode(const References& references, const OpenNode& node, const BuildParameters& parameters,
+                         SubtreeOutput& output)
         : parameters_(parameters),
           traversal_cost_(static_cast<float>(parameters.sah.traversal)),
           block_cost_(static_cast<float>(parameters.sah.block)),
@@ -62,7 +64,7 @@ class SmallNode {
         split(all, node);
     }
 
-   private:
+ private:
     static constexpr int kSlices = 31;
     static constexpr int kPlanes = 32;  ///< per axis, both ends of the tight box among them
 
@@ -74,8 +76,8 @@ class SmallNode {
         float* positions = positions_ + axis * kPlanes;
         uint64_t* left = left_ + axis * kPlanes;
         uint64_t* right = right_ + axis * kPlanes;
-        // How far a reference that is counted on one side of a plane may reach beyond it: rounding of (x - lower) * scale against that of
-        // the plane's position.
+        // How far a reference that is counted on one side of a plane may reach beyond it: rounding of (x - lower) *
+        // scale against that of the plane's position.
         reach_[axis] = (upper - lower) * 0x1p-20F + std::max(std::abs(lower), std::abs(upper)) * 0x1p-22F + 0x1p-120F;
         if (slices.scale == 0) {
             std::fill(positions, positions + kPlanes, std::numeric_limits<float>::infinity());  // never inside the cell
@@ -119,7 +121,8 @@ class SmallNode {
     using DF = hn::Rebind<float, D64>;
 
     /// The cheapest plane inside the cell.
-    HWY_INLINE CheapestPlane<DF> cheapest_plane(uint64_t members, const SplitCosts<DF>& costs, uint64_t affordable) const {
+    HWY_INLINE CheapestPlane<DF> cheapest_plane(uint64_t members, const SplitCosts<DF>& costs,
+                                                uint64_t affordable) const {
         const D64 d64;
         const DF df;
         const hn::RebindToUnsigned<DF> du;
@@ -131,10 +134,13 @@ class SmallNode {
         for (int axis = 0; axis < 3; ++axis) {
             for (int j = 0; j < kPlanes; j += static_cast<int>(hn::Lanes(d64))) {
                 const int at = axis * kPlanes + j;
-                const auto left = hn::TruncateTo(du, hn::PopulationCount(hn::And(hn::Load(d64, left_ + at), member_bits)));
-                const auto right = hn::TruncateTo(du, hn::PopulationCount(hn::And(hn::Load(d64, right_ + at), member_bits)));
+                const auto left =
+                    hn::TruncateTo(du, hn::PopulationCount(hn::And(hn::Load(d64, left_ + at), member_bits)));
+                const auto right =
+                    hn::TruncateTo(du, hn::PopulationCount(hn::And(hn::Load(d64, right_ + at), member_bits)));
                 const auto left_blocks = hn::ConvertTo(df, hn::BitCast(di, hn::ShiftRight<3>(hn::Add(left, round_up))));
-                const auto right_blocks = hn::ConvertTo(df, hn::BitCast(di, hn::ShiftRight<3>(hn::Add(right, round_up))));
+                const auto right_blocks =
+                    hn::ConvertTo(df, hn::BitCast(di, hn::ShiftRight<3>(hn::Add(right, round_up))));
                 const auto cost = costs(axis, hn::Load(df, positions_ + at), left_blocks, right_blocks);
                 const auto is_affordable = hn::Lt(hn::BitCast(di, hn::Add(left, right)), too_many);
                 cheapest.offer(at, hn::IfThenElse(hn::RebindMask(df, is_affordable), cost, hn::Inf(df)));
@@ -163,7 +169,10 @@ class SmallNode {
         const Split split_at{plane / kPlanes, positions_[plane]};
         const uint64_t left_members = members & left_[plane];
         const uint64_t right_members = members & right_[plane];
-        const Partition parts{static_cast<uint32_t>(std::popcount(left_members)), static_cast<uint32_t>(std::popcount(right_members)), {}, {}};
+        const Partition parts{static_cast<uint32_t>(std::popcount(left_members)),
+                              static_cast<uint32_t>(std::popcount(right_members)),
+                              {},
+                              {}};
         OpenNode left;
         OpenNode right;
         open_children(node, split_at, parts, left, right);

@@ -8,17 +8,14 @@
 namespace espalier {
 namespace {
 
-/// Small enough to share out among many threads, large enough that a segment is still worth a vector loop a few levels down.
-uint32_t choose_segment_size(uint32_t triangles) {
-    return std::clamp<uint32_t>(triangles / 64, 1024, 8192);
-}
+/// Small enough to share out among many threads, large enough that a segment is still worth a vector loop a few levels
+/// down.
+uint32_t choose_segment_size(uint32_t triangles) { return std::clamp<uint32_t>(triangles / 64, 1024, 8192); }
 
-/// Segments keep a quarter of their size free, so that most right halves fit behind their left ones although straddlers go to both.
-/// Vector code may touch up to kMargin items behind the last one, which must then be no other segment's.
+/// Segments keep a quarter of their size free, so that most right halves fit behind their left ones although straddlers
+/// go to both. Vector code may touch up to kMargin items behind the last one, which must then be no other segment's.
 constexpr uint32_t kMargin = 16;
-uint32_t with_slack(uint32_t count) {
-    return count + count / 4 + 2 * kMargin;
-}
+uint32_t with_slack(uint32_t count) { return count + count / 4 + 2 * kMargin; }
 
 void add(const BinCounts& part, BinCounts& sum) {
     for (int axis = 0; axis < 3; ++axis) {
@@ -41,7 +38,8 @@ References SegmentMemory::take(uint32_t count) {
     return buffers_.back().references().at(used_ - count);
 }
 
-TopLevels::TopLevels(const TriangleSoup& soup, const BuildParameters& parameters, const std::atomic<bool>* cancel, int threads)
+TopLevels::TopLevels(const TriangleSoup& soup, const BuildParameters& parameters, const std::atomic<bool>* cancel,
+                     int threads)
     : soup_(soup),
       parameters_(parameters),
       cancel_(cancel),
@@ -62,7 +60,8 @@ void TopLevels::make_references() {
         const uint32_t end = std::min(begin + segment_size_, triangles);
         const uint32_t capacity = with_slack(segment_size_);
         const References place = memory_.take(capacity);
-        root.segments[i] = {place, kernels_.make_references(soup_, begin, end, place, bounds[i], rejected[i]), capacity};
+        root.segments[i] = {place, kernels_.make_references(soup_, begin, end, place, bounds[i], rejected[i]),
+                            capacity};
     });
 
     Box3f box;
@@ -123,10 +122,10 @@ void TopLevels::choose_splits(const std::vector<uint32_t>& level, const std::vec
     }
 }
 
-Partition TopLevels::partition_segment(const TopNode& top, const Segment& segment, const References& scratch, Segment& left,
-                                       Segment& right) {
-    const Partition parts =
-        kernels_.partition(soup_, segment.references, segment.count, top.split, parameters_.clip, segment.references, scratch);
+Partition TopLevels::partition_segment(const TopNode& top, const Segment& segment, const References& scratch,
+                                       Segment& left, Segment& right) {
+    const Partition parts = kernels_.partition(soup_, segment.references, segment.count, top.split, parameters_.clip,
+                                               segment.references, scratch);
     const uint32_t both = parts.left_count + parts.right_count;
     if (both + 2 * kMargin <= segment.capacity) {
         const uint32_t left_capacity = parts.left_count + (segment.capacity - both) / 2;

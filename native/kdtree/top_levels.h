@@ -18,11 +18,11 @@ struct Segment {
 
 /// Memory for segments, handed out to any thread.
 class SegmentMemory {
-   public:
+ public:
     explicit SegmentMemory(size_t capacity) { buffers_.emplace_back(capacity); }
     References take(uint32_t count);
 
-   private:
+ private:
     std::mutex mutex_;
     std::deque<ReferenceBuffer> buffers_;
     size_t used_ = 0;  ///< of the last buffer
@@ -32,7 +32,7 @@ class SegmentMemory {
 struct TopNode {
     OpenNode node;
     Split split;
-    uint32_t left = 0;   ///< index among the top nodes, if split
+    uint32_t left = 0;  ///< index among the top nodes, if split
     uint32_t right = 0;
     std::vector<Segment> segments;
 
@@ -41,8 +41,9 @@ struct TopNode {
 
 /// Phases 1 and 2: the references and the top of the tree, all threads on one level at a time.
 class TopLevels {
-   public:
-    TopLevels(const TriangleSoup& soup, const BuildParameters& parameters, const std::atomic<bool>* cancel, int threads);
+ public:
+    TopLevels(const TriangleSoup& soup, const BuildParameters& parameters, const std::atomic<bool>* cancel,
+              int threads);
 
     /// Phase 1: boxes of all faces that can be hit.
     void make_references();
@@ -54,7 +55,7 @@ class TopLevels {
     /// Copies a node's references into one piece.
     void gather(const TopNode& node, const References& to) const;
 
-   private:
+ private:
     struct Part {
         uint32_t node;
         uint32_t segment;
@@ -62,7 +63,8 @@ class TopLevels {
     std::vector<Part> parts_of(const std::vector<uint32_t>& nodes) const;
     void choose_splits(const std::vector<uint32_t>& level, const std::vector<Part>& parts);
     std::vector<uint32_t> open_level(const std::vector<uint32_t>& level, const std::vector<Part>& parts);
-    Partition partition_segment(const TopNode& node, const Segment& segment, const References& scratch, Segment& left, Segment& right);
+    Partition partition_segment(const TopNode& node, const Segment& segment, const References& scratch, Segment& left,
+                                Segment& right);
 
     const TriangleSoup& soup_;
     const BuildParameters& parameters_;
@@ -76,8 +78,6 @@ class TopLevels {
 };
 
 /// Room for the splits of the whole tree to add references, however hostile the scene: 6 for each triangle.
-inline uint64_t spare_references(uint32_t triangles) {
-    return uint64_t{6} * triangles + 1024;
-}
+inline uint64_t spare_references(uint32_t triangles) { return uint64_t{6} * triangles + 1024; }
 
 }  // namespace espalier

@@ -16,9 +16,10 @@
 HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
 
-/// A ray as the box test wants it: per axis which end of a box is near, and where to measure from. The relative error of (plane - origin)
-/// / direction is at most gamma_3 = 3.01 u, u = 2^-24, however far the origin; the two reciprocals take more than the double of it
-/// (pbrt 3rd ed., section 3.9). All t are at least 0, so a near distance may only be made smaller and a far one larger.
+/// A ray as the box test wants it: per axis which end of a box is near, and where to measure from. The relative error
+/// of (plane - origin) / direction is at most gamma_3 = 3.01 u, u = 2^-24, however far the origin; the two reciprocals
+/// take more than the double of it (pbrt 3rd ed., section 3.9). All t are at least 0, so a near distance may only be
+/// made smaller and a far one larger.
 struct BoxRay {
     float near_origin[3];
     float far_origin[3];
@@ -34,7 +35,8 @@ struct BoxRay {
             negative[axis] = direction < 0;
             near_origin[axis] = far_origin[axis] = origin;
             if (direction == 0) {
-                // The ray stays in the slab or outside it: differences to a bound next to the origin, never zero, times infinity.
+                // The ray stays in the slab or outside it: differences to a bound next to the origin, never zero, times
+                // infinity.
                 near_origin[axis] = std::nextafter(origin, kInfinity);
                 far_origin[axis] = std::nextafter(origin, -kInfinity);
                 near_scale[axis] = far_scale[axis] = kInfinity;
@@ -77,7 +79,8 @@ HWY_INLINE void push_children(const BoxRay& ray, uint32_t octant, const WideNode
             const float* upper = node.upper[axis] + first;
             const auto near = hn::Load(d, ray.negative[axis] ? upper : lower);
             const auto far = hn::Load(d, ray.negative[axis] ? lower : upper);
-            const auto t_near = hn::Mul(hn::Sub(near, hn::Set(d, ray.near_origin[axis])), hn::Set(d, ray.near_scale[axis]));
+            const auto t_near =
+                hn::Mul(hn::Sub(near, hn::Set(d, ray.near_origin[axis])), hn::Set(d, ray.near_scale[axis]));
             const auto t_far = hn::Mul(hn::Sub(far, hn::Set(d, ray.far_origin[axis])), hn::Set(d, ray.far_scale[axis]));
             entry = hn::Max(t_near, entry);
             exit = hn::Min(t_far, exit);
@@ -85,7 +88,8 @@ HWY_INLINE void push_children(const BoxRay& ray, uint32_t octant, const WideNode
         // Products that underflow are off by an absolute error as well.
         const auto meets = hn::Le(entry, hn::Add(exit, hn::Set(d, 0x1p-140F)));
         if constexpr (kLanes == WideNode::kWidth && HWY_TARGET != HWY_SSE4) {
-            // All eight in one register: permute by the octant's order and compress onto the stack, without a branch on their number.
+            // All eight in one register: permute by the octant's order and compress onto the stack, without a branch on
+            // their number.
             const auto ranks = hn::Shr(hn::Set(du, node.order[octant]), hn::Mul(hn::Iota(du, 0), hn::Set(du, 3)));
             const auto order = hn::IndicesFromVec(d, hn::And(ranks, hn::Set(du, 7)));
             const auto child = hn::BitCast(du, hn::TableLookupLanes(hn::BitCast(d, hn::Load(du, node.child)), order));
@@ -171,11 +175,15 @@ struct TraceKernels {
 TraceKernels choose_kernels() {
     switch (simd_target()) {
 #if defined(__x86_64__)
-        case HWY_AVX3_DL: return {N_AVX3_DL::intersect, N_AVX3_DL::occluded};
-        case HWY_AVX2: return {N_AVX2::intersect, N_AVX2::occluded};
-        default: return {N_SSE4::intersect, N_SSE4::occluded};
+        case HWY_AVX3_DL:
+            return {N_AVX3_DL::intersect, N_AVX3_DL::occluded};
+        case HWY_AVX2:
+            return {N_AVX2::intersect, N_AVX2::occluded};
+        default:
+            return {N_SSE4::intersect, N_SSE4::occluded};
 #else
-        default: return {N_NEON::intersect, N_NEON::occluded};
+        default:
+            return {N_NEON::intersect, N_NEON::occluded};
 #endif
     }
 }

@@ -17,12 +17,12 @@ enum class Quality { kDraft, kBalanced, kBest };
 
 struct BuildOptions {
     Quality quality = Quality::kBalanced;
-    int threads = 0;                             ///< 0: all the machine has
-    const std::atomic<bool>* cancel = nullptr;   ///< set from another thread, makes build() throw BuildCancelled
+    int threads = 0;                            ///< 0: all the machine has
+    const std::atomic<bool>* cancel = nullptr;  ///< set from another thread, makes build() throw BuildCancelled
 };
 
 class BuildCancelled : public std::runtime_error {
-   public:
+ public:
     BuildCancelled() : std::runtime_error("the build was cancelled") {}
 };
 
@@ -61,7 +61,7 @@ struct BuildReport {
     uint64_t empty_leaves = 0;
     uint64_t references = 0;
     uint64_t wide_nodes = 0;
-    uint64_t bytes = 0;  ///< what the tree keeps: nodes, wide nodes and triangle blocks
+    uint64_t bytes = 0;   ///< what the tree keeps: nodes, wide nodes and triangle blocks
     double sah_cost = 0;  ///< block model, in the units of the constants, per ray that meets the scene's box
     SahConstants sah_constants;
     uint64_t checksum = 0;  ///< of nodes, leaves and wide nodes: the same for every thread count and instruction set
@@ -71,8 +71,8 @@ struct BuildReport {
 /// A kd-tree over triangles and the layout in which rays walk through it. It keeps its own copy of the triangles.
 struct Tree {
     Box3f bounds;
-    LargeBuffer<KdNode> nodes;          ///< depth first; leaves point into blocks
-    LargeBuffer<WideNode> wide_nodes;   ///< root first; empty for a tree without triangles
+    LargeBuffer<KdNode> nodes;         ///< depth first; leaves point into blocks
+    LargeBuffer<WideNode> wide_nodes;  ///< root first; empty for a tree without triangles
     LargeBuffer<TriangleBlock> blocks;
     BuildReport report;
 };

@@ -36,7 +36,7 @@ struct Shade {
 
 std::vector<PixelSum> pixels_in_blocks(const Film::Tile& tile) {
     std::vector<PixelSum> pixels;
-    pixels.reserve(static_cast<size_t>(tile.width * tile.height));
+    pixels.reserve(static_cast<size_t>(tile.width) * static_cast<size_t>(tile.height));
     for (int y0 = 0; y0 < tile.height; y0 += kBlock) {
         for (int x0 = 0; x0 < tile.width; x0 += kBlock) {
             for (int y = y0; y < std::min(y0 + kBlock, tile.height); ++y) {

@@ -49,7 +49,9 @@ std::vector<Ray> make_rays(const Mesh& mesh, uint32_t count, uint32_t seed) {
     std::mt19937 random(seed);
     const auto uniform = [&] { return static_cast<float>(random() >> 8) * 0x1p-24F; };
     const Box3f box = build(mesh.soup(), {Quality::kDraft, 1}).bounds;
-    const auto point = [&] { return box.lower + box.size() * Vec3f{uniform() * 2 - 0.5F, uniform() * 2 - 0.5F, uniform() * 2 - 0.5F}; };
+    const auto point = [&] {
+        return box.lower + box.size() * Vec3f{uniform() * 2 - 0.5F, uniform() * 2 - 0.5F, uniform() * 2 - 0.5F};
+    };
     const auto vertex = [&] {
         const float* p = &mesh.positions[size_t{3} * (random() % (mesh.positions.size() / 3))];
         return Vec3f{p[0], p[1], p[2]};
@@ -59,10 +61,18 @@ std::vector<Ray> make_rays(const Mesh& mesh, uint32_t count, uint32_t seed) {
         const Vec3f from = point();
         const Vec3f axis = (i & 4U) != 0 ? Vec3f{1, 0, 0} : (i & 8U) != 0 ? Vec3f{0, -1, 0} : Vec3f{-0.0F, 0, 1};
         switch (i % 4) {
-            case 0: rays.push_back({from, 0, point() - from, INFINITY}); break;
-            case 1: rays.push_back({from, 0, vertex() - from, INFINITY}); break;                     // at a vertex
-            case 2: rays.push_back({vertex() - axis * (2 * box.size().x), 0, axis, INFINITY}); break;  // along an axis through a vertex
-            default: rays.push_back({from, 0, (vertex() + vertex()) * 0.5F - from, INFINITY}); break;
+            case 0:
+                rays.push_back({from, 0, point() - from, INFINITY});
+                break;
+            case 1:
+                rays.push_back({from, 0, vertex() - from, INFINITY});
+                break;  // at a vertex
+            case 2:
+                rays.push_back({vertex() - axis * (2 * box.size().x), 0, axis, INFINITY});
+                break;  // along an axis through a vertex
+            default:
+                rays.push_back({from, 0, (vertex() + vertex()) * 0.5F - from, INFINITY});
+                break;
         }
     }
     return rays;
@@ -106,7 +116,8 @@ TEST(Traversal, KeepsToTheRaysInterval) {
     const struct {
         float t_min, t_max;
         int triangle;
-    } cases[] = {{0, INFINITY, 0}, {1, 1, 0}, {1.5F, INFINITY, 1}, {1.5F, 2, 1}, {1.25F, 1.75F, -1}, {2.5F, INFINITY, -1}, {0, 0.5F, -1}};
+    } cases[] = {{0, INFINITY, 0},     {1, 1, 0},    {1.5F, INFINITY, 1}, {1.5F, 2, 1}, {1.25F, 1.75F, -1},
+                 {2.5F, INFINITY, -1}, {0, 0.5F, -1}};
     for (const auto& c : cases) {
         const Ray ray{{0, 0, 0}, c.t_min, {0, 0, 1}, c.t_max};
         Hit hit{};

@@ -51,7 +51,8 @@ void for_each_leaf(const Tree& tree, const std::function<void(uint32_t, uint32_t
     const std::function<void(uint32_t)> visit = [&](uint32_t index) {
         const WideNode& node = tree.wide_nodes[index];
         for (int i = 0; i < WideNode::kWidth; ++i) {
-            const Box3f box{{node.lower[0][i], node.lower[1][i], node.lower[2][i]}, {node.upper[0][i], node.upper[1][i], node.upper[2][i]}};
+            const Box3f box{{node.lower[0][i], node.lower[1][i], node.lower[2][i]},
+                            {node.upper[0][i], node.upper[1][i], node.upper[2][i]}};
             if (box.is_empty()) {
                 continue;
             }
@@ -76,8 +77,9 @@ bool contains(const Box3f& box, Vec3d p) {
     return true;
 }
 
-/// Points of every triangle lie in a box that holds the triangle: no clipping may cut anything away. A point formed in double is off the
-/// triangle by less than 2^-50 of its coordinates, the boxes' margin is 2^-22 of them; corners are exact.
+/// Points of every triangle lie in a box that holds the triangle: no clipping may cut anything away. A point formed in
+/// double is off the triangle by less than 2^-50 of its coordinates, the boxes' margin is 2^-22 of them; corners are
+/// exact.
 void expect_everything_covered(const Mesh& mesh, const Tree& tree) {
     const TriangleSoup soup = mesh.soup();
     std::vector<std::vector<Box3f>> boxes(soup.size());
@@ -90,13 +92,17 @@ void expect_everything_covered(const Mesh& mesh, const Tree& tree) {
             }
         }
     });
-    const double weights[][2] = {{0, 0}, {1, 0}, {0, 1}, {0.5, 0.5}, {0.5, 0}, {0.125, 0.25}, {1 / 3., 1 / 3.}, {0, 0.3}, {0.875, 0.0625}};
+    const double weights[][2] = {{0, 0},        {1, 0},           {0, 1},   {0.5, 0.5},     {0.5, 0},
+                                 {0.125, 0.25}, {1 / 3., 1 / 3.}, {0, 0.3}, {0.875, 0.0625}};
     uint32_t uncovered = 0;
     for (uint32_t i = 0; i < soup.size(); ++i) {
         for (const auto& w : weights) {
             const Vec3d corner = to_double(soup.vertex(i, 0));
-            const Vec3d p = corner + (to_double(soup.vertex(i, 1)) - corner) * w[0] + (to_double(soup.vertex(i, 2)) - corner) * w[1];
-            uncovered += std::none_of(boxes[i].begin(), boxes[i].end(), [&](const Box3f& box) { return contains(box, p); }) ? 1U : 0U;
+            const Vec3d p = corner + (to_double(soup.vertex(i, 1)) - corner) * w[0] +
+                            (to_double(soup.vertex(i, 2)) - corner) * w[1];
+            uncovered +=
+                std::none_of(boxes[i].begin(), boxes[i].end(), [&](const Box3f& box) { return contains(box, p); }) ? 1U
+                                                                                                                   : 0U;
         }
     }
     EXPECT_EQ(uncovered, 0U);
@@ -110,8 +116,13 @@ Mesh moved(Mesh mesh, float offset, float scale) {
 }
 
 TEST(Tree, IsWellFormedAndCoversEveryTriangle) {
-    const Mesh meshes[] = {make_sphere(40, 60), make_soup(3000, 1), make_furball(400), make_grid(40),
-                           moved(make_sphere(30, 40), 1e5F, 1), moved(make_soup(2000, 2), 0, 1e-30F), moved(make_soup(2000, 3), -3, 1e15F)};
+    const Mesh meshes[] = {make_sphere(40, 60),
+                           make_soup(3000, 1),
+                           make_furball(400),
+                           make_grid(40),
+                           moved(make_sphere(30, 40), 1e5F, 1),
+                           moved(make_soup(2000, 2), 0, 1e-30F),
+                           moved(make_soup(2000, 3), -3, 1e15F)};
     for (const Mesh& mesh : meshes) {
         for (const Quality quality : kQualities) {
             const Tree tree = build(mesh.soup(), {quality, 1});
@@ -244,7 +255,8 @@ TEST(Tree, CanBeBuiltByManyThreadsAtOnce) {
     std::vector<std::thread> callers;
     std::atomic<int> same{0};
     for (int i = 0; i < 4; ++i) {
-        callers.emplace_back([&] { same += build(mesh.soup(), {Quality::kBalanced, 3}).report.checksum == expected ? 1 : 0; });
+        callers.emplace_back(
+            [&] { same += build(mesh.soup(), {Quality::kBalanced, 3}).report.checksum == expected ? 1 : 0; });
     }
     for (std::thread& caller : callers) {
         caller.join();

@@ -25,7 +25,8 @@ TEST(ClassifyFace, NamesTheFault) {
 TEST(ClassifyFace, DecidesAreaExactly) {
     // On one line to the last bit, with differences that are not floats.
     const float third = 1.0F / 3.0F;
-    EXPECT_EQ(classify_face({third, third, third}, {2 * third, 2 * third, 2 * third}, {1e10F, 1e10F, 1e10F}), FaceFault::kNoArea);
+    EXPECT_EQ(classify_face({third, third, third}, {2 * third, 2 * third, 2 * third}, {1e10F, 1e10F, 1e10F}),
+              FaceFault::kNoArea);
     // One ulp beside it, far from the origin.
     const float x = 16777216.0F;
     EXPECT_EQ(classify_face({x, x, 0}, {x + 2, x + 2, 0}, {2 * x, 2 * x, 0}), FaceFault::kNoArea);
