@@ -4,6 +4,7 @@
 #include <pybind11/pybind11.h>
 
 #include <string>
+#include <utility>
 
 namespace espalier {
 
@@ -39,7 +40,7 @@ class Fields {
 
     template <class T>
     T value_or(const char* key, T fallback) const {
-        return dict_.contains(key) ? convert<T>(dict_[key], key) : fallback;
+        return dict_.contains(key) ? convert<T>(dict_[key], key) : std::move(fallback);
     }
 
  private:
