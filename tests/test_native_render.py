@@ -278,15 +278,16 @@ def test_convex_flat_faces_do_not_shade_themselves(far: float) -> None:
         np.testing.assert_array_equal(shaded, unshaded)
 
 
-def test_smooth_sphere_has_a_smooth_terminator() -> None:
-    vertices, triangles = sphere(8, 12)
+def test_coarse_smooth_sphere_does_not_shade_itself() -> None:
+    # Its faces turn away from the sun before its normals do; shadow rays that began on them
+    # would cut the light off in steps.
+    vertices, triangles = sphere(6, 8)
     what = scene([mesh(vertices, triangles, normals=vertices)])
     view = camera(looking((0, -5, 0), (0, 0, 0)), box_view(-1.2, 1.2, -1.2, 1.2))
     sun = light("SUN", looking((3, -1, 0.5), (0, 0, 0)), np.pi, angle=0.0)
     shaded, unshaded = (draw(what, view, [sun | {"shadow": shadow}], (64, 64), samples=16) for shadow in (True, False))
-    lit = unshaded[..., 0] > 0.02
-    # Faces that turn away from the sun would cut their own light off in steps if shadow rays began on them.
-    assert np.count_nonzero(shaded[..., 0][lit] < 0.5 * unshaded[..., 0][lit]) < 0.03 * np.count_nonzero(lit)
+    assert np.count_nonzero(unshaded[..., 0]) > 1000
+    np.testing.assert_array_equal(shaded, unshaded)
 
 
 def mirrored(vertices: Floats) -> Floats:

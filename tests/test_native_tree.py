@@ -36,7 +36,7 @@ def test_hits_are_those_of_a_loop_over_all_triangles(name: str) -> None:
     for quality in QUALITIES:
         hits = espalier_native.build(vertices, triangles, quality).intersect(origins, directions)
         np.testing.assert_array_equal(hits["triangle"], triangle)
-        np.testing.assert_allclose(hits["t"], t, rtol=1e-5)
+        np.testing.assert_allclose(hits["t"], t, rtol=2**-23)
 
 
 @pytest.mark.parametrize("name", ["bunny", "sponza", "armadillo"])
@@ -56,11 +56,10 @@ def test_hits_are_embrees(name: str) -> None:
     size = float(np.linalg.norm(vertices.max(0) - vertices.min(0)))
     both = their_hit & (ours["triangle"] >= 0)
     np.testing.assert_allclose(ours["t"][both], theirs["tfar"][both], rtol=1e-5, atol=1e-5 * size)
-    # Another face is named only where two lie nearly on one another, at distances that float cannot tell apart.
-    assert np.count_nonzero(theirs["primID"][both] != ours["triangle"][both]) <= 25
-    # A ray that hits for one and misses for the other is put before the plain loop.
-    differ = np.flatnonzero(their_hit != (ours["triangle"] >= 0))
-    assert len(differ) <= 2
+    # Embree decides in float: where faces meet or nearly lie on one another it may name another.
+    # The plain loop is the judge.
+    differ = np.flatnonzero(theirs["primID"] != ours["triangle"])
+    assert len(differ) <= 25
     _, triangle = nearest_hits(vertices, triangles, origins[differ], directions[differ])
     np.testing.assert_array_equal(ours["triangle"][differ], triangle)
 
@@ -164,9 +163,13 @@ def test_range_per_ray_is_that_rays_own() -> None:
     origins, directions = rays_through(vertices, 9000, seed=8)
     t = tree.intersect(origins, directions)["t"]
     hit = np.isfinite(t)
-    beyond = np.where(hit, np.nextafter(t, np.float32(np.inf)), np.float32(0))
-    np.testing.assert_array_equal(tree.intersect(origins[hit], directions[hit], t_max=t[hit])["t"], t[hit])
-    assert np.all(tree.intersect(origins[hit], directions[hit], t_min=beyond[hit])["t"] > t[hit])
+    origins, directions, t = origins[hit], directions[hit], t[hit]
+    # The distance that is returned is rounded; the true one lies between its two neighbours.
+    before, after = np.nextafter(t, np.float32(0)), np.nextafter(t, np.float32(np.inf))
+    np.testing.assert_array_equal(tree.intersect(origins, directions, t_max=after)["t"], t)
+    np.testing.assert_array_equal(tree.intersect(origins, directions, t_min=before)["t"], t)
+    assert not tree.occluded(origins, directions, t_max=before).any()
+    assert np.all(tree.intersect(origins, directions, t_min=after)["t"] > t)
 
 
 def test_tiny_inputs() -> None:

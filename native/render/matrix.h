@@ -39,12 +39,11 @@ struct Matrix4 {
     }
 };
 
-/// The map that carries normals when `matrix` carries points, up to length. It is the inverse transpose times
-/// |determinant|, which also exists where a scale is zero, and keeps an outward normal outward under mirroring.
+/// The map that carries normals when `matrix` carries points, up to length and sign: the inverse transpose times the
+/// determinant, which also exists where a scale is zero.
 inline std::array<Vec3d, 3> normal_columns(const Matrix4& matrix) {
     const Vec3d x = matrix.column(0), y = matrix.column(1), z = matrix.column(2);
-    const double sign = dot(x, cross(y, z)) < 0.0 ? -1.0 : 1.0;
-    return {cross(y, z) * sign, cross(z, x) * sign, cross(x, y) * sign};
+    return {cross(y, z), cross(z, x), cross(x, y)};
 }
 
 }  // namespace espalier

@@ -265,7 +265,7 @@ SurfacePoint Scene::surface(uint32_t triangle, double u, double v, Vec3d directi
         sum += normal[k] * weight[k];
     }
     point.shading_normal = normalize_or(sum, wound);
-    double side = 1.0;
+    double side = 1.0;  // normals of a mirrored object come out of the map reversed, those of back faces look away
     if (dot(point.shading_normal, point.geometric_normal) < 0.0) {
         point.shading_normal = -point.shading_normal;
         side = -1.0;
