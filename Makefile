@@ -50,13 +50,16 @@ sanitize-%: python
 	cmake --build --preset $* -j $(JOBS)
 	ctest --preset $* --output-on-failure
 
-lint: native
+lint: python
+	@tools/need libgtest-dev
+	@tools/environment .venv "3.11 3.13" -r requirements/test.txt
 	@tools/environment .venv "3.11 3.13" -r requirements/lint.txt
 	ruff check .
 	ruff format --check .
 	mypy addon scenes tests tools
 	git ls-files '*.h' '*.cpp' | xargs clang-format --dry-run -Werror
-	git ls-files 'native/*.cpp' | xargs -P $(JOBS) -n 1 clang-tidy --quiet -p build/release
+	cmake --preset release -B build/lint -DESPALIER_MODULE=ON -Dpybind11_DIR="$$(python -m pybind11 --cmakedir)" >/dev/null
+	git ls-files '*.cpp' | xargs -P $(JOBS) -n 1 clang-tidy --quiet -p build/lint
 
 format: python
 	@tools/environment .venv "3.11 3.13" -r requirements/lint.txt

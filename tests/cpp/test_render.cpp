@@ -169,7 +169,7 @@ TEST(Render, TilesCoverTheFilmOnceFromTheMiddleOutwards) {
         for (const Film::Tile& tile : film.tiles()) {
             for (int y = tile.y; y < tile.y + tile.height; ++y) {
                 for (int x = tile.x; x < tile.x + tile.width; ++x) {
-                    ++covered.at(static_cast<size_t>(y * width + x));
+                    ++covered.at(static_cast<size_t>(y) * width + x);
                 }
             }
         }
