@@ -8,6 +8,7 @@
 #include <stdexcept>
 #include <unordered_map>
 
+#include "geometry/float_environment.h"
 #include "geometry/triangle.h"
 #include "kdtree/parallel.h"
 
@@ -102,6 +103,7 @@ void check_placement(const Placement& placement, size_t meshes, size_t materials
 
 Scene::Scene(std::span<const MeshInput> meshes, std::span<const Placement> placements, std::span<const float> materials,
              int threads) {
+    const FloatEnvironment environment;
     const auto start = std::chrono::steady_clock::now();
     if (threads <= 0)
         threads = hardware_threads();
