@@ -92,8 +92,14 @@ class SmallNode {
             q.begin[i] = kPlanes;
             q.end[i] = 0;
         }
+        for (int j = 0; j < kPlanes; j += static_cast<int>(hn::Lanes(df))) {  // as in slice_position
+            const hn::RebindToSigned<decltype(df)> di;
+            const auto fraction =
+                hn::Mul(hn::ConvertTo(df, hn::Iota(di, j)), hn::Set(df, 1.0F / static_cast<float>(kSlices)));
+            hn::Store(hn::Add(hn::Set(df, lower), hn::Mul(hn::Set(df, upper - lower), fraction)), df, positions + j);
+        }
+        positions[kSlices] = upper;
         for (int j = 0; j < kPlanes; ++j) {
-            positions[j] = slice_position(lower, upper, j, kSlices);
             uint64_t begins_before = 0;
             uint64_t ends_behind = 0;
             for (size_t i = 0; i < kSmallNode; i += hn::Lanes(d8)) {

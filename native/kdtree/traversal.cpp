@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 #include "kdtree/traversal.h"
 
+#include <bit>
+
 #include "geometry/float_environment.h"
 #include "kdtree/simd_config.h"
 #include "kdtree/simd_target.h"
@@ -63,9 +65,10 @@ struct TraversalStack {
     int count = 0;
 };
 
-/// Pushes the children that the ray meets, the nearest last.
-HWY_INLINE void push_children(const BoxRay& ray, uint32_t octant, const WideNode& node, float t_min, float t_max,
-                              TraversalStack& stack) {
+/// Finds the children that the ray meets: the nearest goes to `next`, the others onto the stack, nearer ones later.
+/// False if there is none.
+HWY_INLINE bool meet_children(const BoxRay& ray, uint32_t octant, const WideNode& node, float t_min, float t_max,
+                              TraversalStack& stack, uint32_t& next) {
     const hn::CappedTag<float, WideNode::kWidth> d;
     const hn::RebindToUnsigned<decltype(d)> du;
     constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<float, WideNode::kWidth>());
@@ -95,9 +98,17 @@ HWY_INLINE void push_children(const BoxRay& ray, uint32_t octant, const WideNode
             const auto child = hn::BitCast(du, hn::TableLookupLanes(hn::BitCast(d, hn::Load(du, node.child)), order));
             const auto distance = hn::TableLookupLanes(hn::IfThenElse(meets, entry, hn::Inf(d)), order);
             const auto pushed = hn::Lt(distance, hn::Inf(d));
+            uint8_t bits[8] = {};
+            hn::StoreMaskBits(d, pushed, bits);
+            if (bits[0] == 0) {
+                return false;
+            }
             hn::CompressStore(child, hn::RebindMask(du, pushed), du, stack.child + stack.count);
-            stack.count += static_cast<int>(hn::CompressStore(distance, pushed, d, stack.distance + stack.count));
-            return;
+            hn::CompressStore(distance, pushed, d, stack.distance + stack.count);
+            // The nearest is the last: taken from the node, since the stack's is still on its way to memory.
+            stack.count += std::popcount(bits[0]) - 1;
+            next = node.child[node.order[octant] >> (3 * (std::bit_width(bits[0]) - 1)) & 7U];
+            return true;
         }
         hn::Store(entry, d, distances + first);
         uint8_t bits[8] = {};
@@ -111,6 +122,11 @@ HWY_INLINE void push_children(const BoxRay& ray, uint32_t octant, const WideNode
         stack.distance[stack.count] = distances[slot];
         stack.count += static_cast<int>(met >> slot & 1U);
     }
+    if (met == 0) {
+        return false;
+    }
+    next = stack.child[--stack.count];
+    return true;
 }
 
 template <bool kAnyHit>
@@ -119,28 +135,31 @@ HWY_INLINE void trace(const Tree& tree, const Ray& ray, NearestHit& nearest) {
         return;
     }
     const BoxRay box_ray(ray);
-    const ShearedRay sheared(ray.direction);
+    const ShearedRay sheared(ray.origin, ray.direction);
     const uint32_t octant = box_ray.octant();
     const WideNode* nodes = tree.wide_nodes.data();
     const TriangleBlock* blocks = tree.blocks.data();
     TraversalStack stack;
-    push_children(box_ray, octant, nodes[0], ray.t_min, nearest.reach(), stack);
-    while (stack.count > 0) {
-        --stack.count;
-        if (stack.distance[stack.count] > nearest.reach()) {
-            continue;
-        }
-        const uint32_t child = stack.child[stack.count];
+    for (uint32_t child = 0;;) {
         if ((child & WideNode::kLeafFlag) == 0) {
-            push_children(box_ray, octant, nodes[child], ray.t_min, nearest.reach(), stack);
-            continue;
-        }
-        const TriangleBlock* block = blocks + WideNode::first_block(child);
-        for (const TriangleBlock* end = block + WideNode::blocks(child); block != end; ++block) {
-            if (test_block<kAnyHit>(ray, sheared, *block, nearest) && kAnyHit) {
-                return;
+            if (meet_children(box_ray, octant, nodes[child], ray.t_min, nearest.reach(), stack, child)) {
+                continue;
+            }
+        } else {
+            const TriangleBlock* block = blocks + WideNode::first_block(child);
+            for (const TriangleBlock* end = block + WideNode::blocks(child); block != end; ++block) {
+                if (test_block<kAnyHit>(ray, sheared, *block, nearest) && kAnyHit) {
+                    return;
+                }
             }
         }
+        do {
+            if (stack.count == 0) {
+                return;
+            }
+            --stack.count;
+        } while (stack.distance[stack.count] > nearest.reach());
+        child = stack.child[stack.count];
     }
 }
 

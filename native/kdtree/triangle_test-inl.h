@@ -28,13 +28,17 @@ namespace hn = hwy::HWY_NAMESPACE;
 /// component, then sheared (Woop, Benthin and Wald 2013).
 struct ShearedRay {
     int kx, ky, kz;
+    float ox, oy, oz;  ///< the origin, permuted
     float sx, sy, sz;
 
-    explicit ShearedRay(Vec3f direction) {
+    explicit ShearedRay(Vec3f origin, Vec3f direction) {
         const Vec3f d{std::abs(direction.x), std::abs(direction.y), std::abs(direction.z)};
         kz = d.x > d.y ? (d.x > d.z ? 0 : 2) : (d.y > d.z ? 1 : 2);
         kx = (kz + 1) % 3;
         ky = (kz + 2) % 3;
+        ox = origin[kx];
+        oy = origin[ky];
+        oz = origin[kz];
         sz = 1.0F / direction[kz];
         sx = direction[kx] * sz;
         sy = direction[ky] * sz;
@@ -94,7 +98,7 @@ class NearestHit {
 /// is off by at most u (2 mx + 5 mz), since the shear carries two roundings, z one, their product and the difference
 /// one each and x one. An edge function, a difference of two products of such, is then off by at most u (12 mx my + 10
 /// mz (mx + my)) + 50 u^2 mz^2, and `bound` is above that by more than the roundings of its own sum.
-HWY_INLINE uint32_t possible_hits(const Ray& ray, const ShearedRay& sheared, const TriangleBlock& block, float reach) {
+HWY_INLINE uint32_t possible_hits(const ShearedRay& sheared, const TriangleBlock& block, float t_min, float reach) {
     const hn::CappedTag<float, kBlockSize> d;
     constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<float, kBlockSize>());
     using V = hn::Vec<decltype(d)>;
@@ -104,13 +108,11 @@ HWY_INLINE uint32_t possible_hits(const Ray& ray, const ShearedRay& sheared, con
         V y[3];
         V z[3];
         for (int k = 0; k < 3; ++k) {
-            z[k] = hn::Sub(hn::Load(d, block.vertex[k][sheared.kz] + first), hn::Set(d, ray.origin[sheared.kz]));
-            x[k] =
-                hn::Sub(hn::Sub(hn::Load(d, block.vertex[k][sheared.kx] + first), hn::Set(d, ray.origin[sheared.kx])),
-                        hn::Mul(hn::Set(d, sheared.sx), z[k]));
-            y[k] =
-                hn::Sub(hn::Sub(hn::Load(d, block.vertex[k][sheared.ky] + first), hn::Set(d, ray.origin[sheared.ky])),
-                        hn::Mul(hn::Set(d, sheared.sy), z[k]));
+            z[k] = hn::Sub(hn::Load(d, block.vertex[k][sheared.kz] + first), hn::Set(d, sheared.oz));
+            x[k] = hn::Sub(hn::Sub(hn::Load(d, block.vertex[k][sheared.kx] + first), hn::Set(d, sheared.ox)),
+                           hn::Mul(hn::Set(d, sheared.sx), z[k]));
+            y[k] = hn::Sub(hn::Sub(hn::Load(d, block.vertex[k][sheared.ky] + first), hn::Set(d, sheared.oy)),
+                           hn::Mul(hn::Set(d, sheared.sy), z[k]));
         }
         const auto largest = [](const V(&c)[3]) {
             return hn::Max(hn::Max(hn::Abs(c[0]), hn::Abs(c[1])), hn::Abs(c[2]));
@@ -148,7 +150,7 @@ HWY_INLINE uint32_t possible_hits(const Ray& ray, const ShearedRay& sheared, con
         const V t = hn::Mul(mean, hn::Set(d, sheared.sz));
         const V t_error = hn::Mul(error, hn::Set(d, std::abs(sheared.sz)));
         const auto too_far = hn::Gt(hn::Sub(t, t_error), hn::Set(d, reach));
-        const auto too_near = hn::Lt(hn::Add(t, t_error), hn::Set(d, ray.t_min));
+        const auto too_near = hn::Lt(hn::Add(t, t_error), hn::Set(d, t_min));
         const auto ruled_out = hn::And(hn::Gt(sure, hn::Zero(d)), hn::Or(too_far, too_near));
         uint8_t bits[8] = {};
         hn::StoreMaskBits(d, hn::AndNot(ruled_out, inside), bits);
@@ -161,7 +163,7 @@ HWY_INLINE uint32_t possible_hits(const Ray& ray, const ShearedRay& sheared, con
 template <bool kAnyHit>
 HWY_INLINE bool test_block(const Ray& ray, const ShearedRay& sheared, const TriangleBlock& block, NearestHit& nearest) {
     bool taken = false;
-    for (uint32_t lanes = possible_hits(ray, sheared, block, nearest.reach()); lanes != 0; lanes &= lanes - 1) {
+    for (uint32_t lanes = possible_hits(sheared, block, ray.t_min, nearest.reach()); lanes != 0; lanes &= lanes - 1) {
         taken |= nearest.offer(block, static_cast<uint32_t>(std::countr_zero(lanes)));
         if (kAnyHit && taken) {
             return true;
