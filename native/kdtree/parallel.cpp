@@ -45,7 +45,11 @@ struct alignas(64) Worker {
 class Pool {
  public:
     void run(int threads, void (*body)(void*, int), void* context) {
-        const std::lock_guard lock(mutex_);  // jobs of several callers take turns
+        const std::unique_lock lock(mutex_, std::try_to_lock);
+        if (!lock) {  // another caller has the workers: better alone than waiting, deaf to cancels, for its end
+            body(context, 0);
+            return;
+        }
         grow(threads - 1);
         remaining_.store(threads - 1, std::memory_order_relaxed);
         for (int i = 0; i < threads - 1; ++i) {

@@ -14,8 +14,8 @@ namespace espalier {
 int hardware_threads();
 
 /// Runs body(context, worker) once for each worker in [0, threads), worker 0 being the calling thread, and returns when
-/// all have ended. The threads are kept for the next call. A call made from inside a body runs on the calling thread
-/// alone.
+/// all have ended. The threads are kept for the next call. While they are busy for another caller, and in calls made
+/// from inside a body, worker 0 runs alone.
 void run_on_threads(int threads, void (*body)(void* context, int worker), void* context);
 
 /// Calls f(i) or f(i, worker) for each i in [0, count) on at most `threads` threads, the calling one included; worker

@@ -2,6 +2,7 @@
 #include <gtest/gtest.h>
 
 #include <stdexcept>
+#include <thread>
 #include <vector>
 
 #include "kdtree/parallel.h"
@@ -45,6 +46,26 @@ TEST(Parallel, CanBeNested) {
     std::atomic<int> count{0};
     parallel_for(3, 8, [&](size_t) { parallel_for(3, 8, [&](size_t) { ++count; }); });
     EXPECT_EQ(count, 64);
+}
+
+TEST(Parallel, DoesNotWaitForAnotherCallersWork) {
+    std::atomic<int> inside{0};
+    std::atomic<bool> may_end{false};
+    std::thread other([&] {
+        parallel_for(2, 2, [&](size_t) {
+            ++inside;
+            may_end.wait(false);
+        });
+    });
+    while (inside < 2) {
+        std::this_thread::yield();
+    }
+    int sum = 0;
+    parallel_for(2, 10, [&](size_t i) { sum += static_cast<int>(i); });  // alone, so without a race
+    EXPECT_EQ(sum, 45);
+    may_end = true;
+    may_end.notify_all();
+    other.join();
 }
 
 }  // namespace
