@@ -290,6 +290,21 @@ def test_coarse_smooth_sphere_does_not_shade_itself() -> None:
     np.testing.assert_array_equal(shaded, unshaded)
 
 
+def normalized(vectors: Doubles) -> Doubles:
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def test_thin_things_on_a_smooth_face_keep_their_shadow() -> None:
+    # The smooth surface that these normals suggest bulges through the plate: what lies below it stays dark.
+    corners = np.array([[-4, -4, 0], [4, -4, 0], [4, 4, 0], [-4, 4, 0]])
+    cushion = mesh(corners, QUAD, normals=normalized(corners + np.array([0, 0, 8])))
+    plate = mesh(np.array([[-1, -1, 0.05], [1, -1, 0.05], [1, 1, 0.05], [-1, 1, 0.05]]), QUAD)
+    below_plate = camera(moved(0, 0, 0.04), box_view(-0.9, 0.9, -0.9, 0.9, near=0.001))
+    sun = light("SUN", moved(0, 0, 1), 1.0, angle=0.0)
+    assert draw(scene([cushion]), below_plate, [sun])[..., 0].min() > 0.2
+    assert draw(scene([cushion, plate]), below_plate, [sun])[..., 0].max() == 0
+
+
 def mirrored(vertices: Floats) -> Floats:
     return vertices * np.array([-1, 1, 1], np.float32)
 

@@ -109,6 +109,24 @@ class TileTracer {
                 {scene_.surface(static_cast<uint32_t>(hit.triangle), hit.u, hit.v, to_double(rays_[i].direction)),
                  pixel, static_cast<uint32_t>(first_sample) + static_cast<uint32_t>(i / pixels_.size())});
         }
+        drop_blocked_lifts();
+    }
+
+    void drop_blocked_lifts() {
+        rays_.clear();
+        std::vector<SurfacePoint*> lifted;
+        for (Shade& shade : shades_) {
+            if (const std::optional<Ray> ray = lift_ray(shade.surface)) {
+                rays_.push_back(*ray);
+                lifted.push_back(&shade.surface);
+            }
+        }
+        blocked_.resize(rays_.size());
+        occluded(tree_, rays_, blocked_);
+        for (size_t i = 0; i < lifted.size(); ++i) {
+            if (blocked_[i] != 0)
+                lifted[i]->shadow_lift = {0.0, 0.0, 0.0};
+        }
     }
 
     void trace_light(const Film& film, size_t index) {

@@ -10,16 +10,28 @@ namespace {
 
 double largest(Vec3d v) { return std::max({std::abs(v.x), std::abs(v.y), std::abs(v.z)}); }
 
-}  // namespace
-
-Ray shadow_ray(const SurfacePoint& surface, const LightSample& sample) {
+/// A point that lies, once rounded to float, on the outer side of the triangle that `point` was lifted from.
+Vec3f lift_off(const SurfacePoint& surface, Vec3d point) {
     const Vec3d normal = surface.geometric_normal;
-    const Vec3d lifted = surface.position + surface.shadow_lift;
     // Rounding moves each coordinate by at most 2^-24 of it; twice what that can take away along the normal is added
     // beforehand.
-    const double rounding =
-        std::abs(normal.x * lifted.x) + std::abs(normal.y * lifted.y) + std::abs(normal.z * lifted.z);
-    const Vec3f start = to_float(lifted + normal * (surface.error + rounding * 0x1p-23));
+    const double rounding = std::abs(normal.x * point.x) + std::abs(normal.y * point.y) + std::abs(normal.z * point.z);
+    return to_float(point + normal * (surface.error + rounding * 0x1p-23));
+}
+
+}  // namespace
+
+std::optional<Ray> lift_ray(const SurfacePoint& surface) {
+    const Vec3f start = lift_off(surface, surface.position);
+    const Vec3f way = lift_off(surface, surface.position + surface.shadow_lift) - start;
+    if (largest(to_double(way)) < 0x1p-100)
+        return std::nullopt;
+    return Ray{start, 0.0F, way, 1.0F};
+}
+
+Ray shadow_ray(const SurfacePoint& surface, const LightSample& sample) {
+    const Vec3d lifted = surface.position + surface.shadow_lift;
+    const Vec3f start = lift_off(surface, lifted);
     if (sample.distant)
         return {start, 0.0F, to_float(sample.to_light), std::numeric_limits<float>::infinity()};
 
