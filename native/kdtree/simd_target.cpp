@@ -62,7 +62,7 @@ int64_t simd_target() {
 std::vector<std::string> simd_target_names() {
     std::vector<std::string> names;
     for (const NamedTarget& target : runnable_targets()) {
-        names.emplace_back(target.name);
+        names.insert(target.bit == simd_target() ? names.begin() : names.end(), target.name);
     }
     return names;
 }

@@ -11,7 +11,7 @@ namespace espalier {
 /// ESPALIER_SIMD names. Throws std::runtime_error if that names none this machine runs.
 int64_t simd_target();
 
-/// Names for ESPALIER_SIMD of the sets that this machine runs, best first.
+/// Names for ESPALIER_SIMD of the sets that this machine runs: the one in use, then the others, best first.
 std::vector<std::string> simd_target_names();
 
 }  // namespace espalier

@@ -10,9 +10,10 @@ inline constexpr const char* kModule =
 build() makes a Tree over triangles, to be asked for hits. Scene, render(), start_preview() and
 start_compare() draw placed meshes with a camera and lights, and time the building.)";
 
-inline constexpr const char* kSimdTargets = R"(The instruction sets this machine can run, best first.
+inline constexpr const char* kSimdTargets =
+    R"(The instruction sets this machine can run: the one in use, then the others, best first.
 
-The first is used, unless the environment variable ESPALIER_SIMD names another before the first call.)";
+The best is used, unless the environment variable ESPALIER_SIMD names another before the first call.)";
 
 inline constexpr const char* kHardwareThreads =
     "How many threads this process may run at the same time: what threads=0 stands for.";
