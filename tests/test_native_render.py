@@ -291,7 +291,8 @@ def test_coarse_smooth_sphere_does_not_shade_itself() -> None:
 
 
 def normalized(vectors: Doubles) -> Doubles:
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    unit: Doubles = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    return unit
 
 
 def test_thin_things_on_a_smooth_face_keep_their_shadow() -> None:
