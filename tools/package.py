@@ -44,7 +44,7 @@ def build_wheel(python: Path, version: str) -> Path:
     for old in WHEELS.glob(f"*-{tag}-*.whl"):
         old.unlink()
     options = ("--no-build-isolation", "--no-deps", "--quiet", "--disable-pip-version-check")
-    run(python, "-m", "pip", "wheel", *options, "-C", f"build-dir=build/{tag}", "-w", WHEELS, ROOT)
+    run(python, "-m", "pip", "wheel", *options, "--config-settings", f"build-dir=build/{tag}", "-w", WHEELS, ROOT)
     (wheel,) = WHEELS.glob(f"*-{tag}-*.whl")
     return wheel
 
