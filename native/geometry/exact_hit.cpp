@@ -108,12 +108,15 @@ bool hit_exactly(Vec3f origin, Vec3f direction, const Vec3f (&corner)[3], ExactH
     const double reach = std::abs(d[axis]);
     hit.t = mean / d[axis];
     hit.error = (error * spread / (std::abs(det) - error) + 0x1p-49 * size) / reach;
-    if (!(hit.error <= std::abs(hit.t) * 0x1p-28)) {  // too close to the origin for its distance to be sure
-        const Quotient distance = exact_distance(origin, direction, corner);
+    return true;
+}
+
+void finish_distance(Vec3f origin, Vec3f direction, ExactHit& hit) {
+    if (!(hit.error <= std::abs(hit.t) * 0x1p-28)) {
+        const Quotient distance = exact_distance(origin, direction, hit.corner);
         hit.t = distance.above.estimate() / distance.below.estimate();
         hit.error = std::abs(hit.t) * 0x1p-50;
     }
-    return true;
 }
 
 int compare_distance(Vec3f origin, Vec3f direction, const ExactHit& a, const ExactHit& b) {

@@ -17,12 +17,15 @@ struct ExactHit {
 };
 
 /// Decides as infinite precision would whether the line origin + t direction meets the closed triangle in one point; a
-/// line in the triangle's plane does not. On a hit fills in everything but `triangle`: t to a relative error of 2^-27,
-/// u and v to 2^-26.
+/// line in the triangle's plane does not. On a hit fills in everything but `triangle`; u and v are off by at most
+/// 2^-26.
 ///
 /// All coordinates are floats of at most 2^60 (kMaxCoordinate), the direction's largest component lies in [2^-100,
 /// 2^100], and the triangle has an area.
 bool hit_exactly(Vec3f origin, Vec3f direction, const Vec3f (&corner)[3], ExactHit& hit);
+
+/// Narrows t down to a relative error of 2^-27, which one hit of many needs.
+void finish_distance(Vec3f origin, Vec3f direction, ExactHit& hit);
 
 /// The sign of a's true distance less b's.
 int compare_distance(Vec3f origin, Vec3f direction, const ExactHit& a, const ExactHit& b);

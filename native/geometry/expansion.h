@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 #pragma once
 
-#include <cmath>
-#include <vector>
+#include <algorithm>
+#include <array>
+#include <cstddef>
 
 namespace espalier {
 
@@ -12,11 +13,13 @@ namespace espalier {
 /// of floats of at most 2^61: all are multiples of 2^-149, and so the product's last bit lies above 2^-1074.
 class Expansion {
  public:
-    Expansion() = default;
-    explicit Expansion(double value) {
-        if (value != 0) {
-            parts_.push_back(value);
-        }
+    Expansion() {}  // NOLINT(modernize-use-equals-default): the parts stay unset
+    explicit Expansion(double value) { append(value); }
+    Expansion(const Expansion& other) { *this = other; }
+    Expansion& operator=(const Expansion& other) {
+        count_ = other.count_;
+        std::copy(other.begin(), other.end(), parts_.begin());
+        return *this;
     }
 
     /// a - b, exactly.
@@ -28,22 +31,22 @@ class Expansion {
 
     friend Expansion operator+(const Expansion& a, const Expansion& b) {
         Expansion sum = a;
-        for (const double part : b.parts_) {
+        for (const double part : b) {
             sum.grow(part);
         }
         return sum;
     }
     friend Expansion operator-(const Expansion& a, const Expansion& b) {
         Expansion sum = a;
-        for (const double part : b.parts_) {
+        for (const double part : b) {
             sum.grow(-part);
         }
         return sum;
     }
     friend Expansion operator*(const Expansion& a, const Expansion& b) {
         Expansion product;
-        for (const double x : a.parts_) {
-            for (const double y : b.parts_) {
+        for (const double x : a) {
+            for (const double y : b) {
                 product.add_product(x, y);
             }
         }
@@ -51,35 +54,70 @@ class Expansion {
     }
 
     /// -1, 0 or 1: the sign of the largest part, which outweighs all others together.
-    int sign() const { return parts_.empty() ? 0 : (parts_.back() > 0 ? 1 : -1); }
+    int sign() const { return count_ == 0 ? 0 : (parts_[count_ - 1] > 0 ? 1 : -1); }
 
     /// The value to within a relative error of 2^-52.
     double estimate() const {
         double sum = 0;
-        for (const double part : parts_) {
+        for (const double part : *this) {
             sum += part;
         }
         return sum;
     }
 
  private:
+    /// Compressed, an expansion has few parts: 41 of 53 bits each make up the 2098 bits that doubles can name.
+    static constexpr size_t kCapacity = 96;
+
+    const double* begin() const { return parts_.data(); }
+    const double* end() const { return parts_.data() + count_; }
+
+    void append(double part) {
+        if (part != 0) {
+            parts_[count_++] = part;
+        }
+    }
+
     /// GROW-EXPANSION with zero elimination: each step is TWO-SUM (Knuth).
     void grow(double value) {
-        size_t kept = 0;
+        if (count_ + 1 == kCapacity) {
+            compress();
+        }
+        const size_t old_count = count_;
+        count_ = 0;
         double carry = value;
-        for (const double part : parts_) {
+        for (size_t i = 0; i < old_count; ++i) {
+            const double part = parts_[i];
             const double sum = carry + part;
             const double virtual_part = sum - carry;
-            const double error = (carry - (sum - virtual_part)) + (part - virtual_part);
-            if (error != 0) {
-                parts_[kept++] = error;
-            }
+            append((carry - (sum - virtual_part)) + (part - virtual_part));
             carry = sum;
         }
-        parts_.resize(kept);
-        if (carry != 0) {
-            parts_.push_back(carry);
+        append(carry);
+    }
+
+    /// COMPRESS: the same value in as few parts as it needs. Each step is FAST-TWO-SUM (Dekker), larger summand first.
+    void compress() {
+        size_t bottom = count_ - 1;
+        double carry = parts_[bottom];
+        for (size_t i = bottom; i-- > 0;) {
+            const double sum = carry + parts_[i];
+            const double error = parts_[i] - (sum - carry);
+            carry = sum;
+            if (error != 0) {
+                parts_[bottom--] = carry;
+                carry = error;
+            }
         }
+        parts_[bottom] = carry;
+        const size_t old_count = count_;
+        count_ = 0;
+        for (size_t i = bottom + 1; i < old_count; ++i) {
+            const double sum = parts_[i] + carry;
+            append(carry - (sum - parts_[i]));
+            carry = sum;
+        }
+        append(carry);
     }
 
     /// TWO-PRODUCT (Dekker, Veltkamp): without fused operations, so that every machine takes the same way.
@@ -99,7 +137,8 @@ class Expansion {
         grow(product);
     }
 
-    std::vector<double> parts_;
+    size_t count_ = 0;
+    std::array<double, kCapacity> parts_;  // only the first count_ hold anything
 };
 
 }  // namespace espalier

@@ -75,14 +75,15 @@ class NearestHit {
             }
         }
         hit_ = candidate;
-        reach_ = static_cast<float>(hit_.t) * (1 + 0x1p-22F) + 0x1p-140F;
+        reach_ = static_cast<float>(hit_.t + hit_.error) * (1 + 0x1p-22F) + 0x1p-140F;
         return true;
     }
 
-    Hit result() const {
+    Hit result() {
         if (!found()) {
             return {ray_.t_max, 0, 0, -1};
         }
+        finish_distance(ray_.origin, ray_.direction, hit_);
         return {static_cast<float>(hit_.t), static_cast<float>(hit_.u), static_cast<float>(hit_.v), hit_.triangle};
     }
 
