@@ -67,7 +67,7 @@ format: python
 	ruff format .
 	git ls-files '*.h' '*.cpp' | xargs clang-format -i
 
-blenders:
+blenders: system
 	@tools/environment $(CACHE)/bpy-4.2.23 3.11 bpy==4.2.23
 	@tools/environment $(CACHE)/bpy-5.0.1 3.11 bpy==5.0.1
 	@tools/environment $(CACHE)/bpy-5.2.3 3.13 bpy==5.2.3

@@ -80,4 +80,5 @@ class Folder:
 
 
 REAL = Blender("blender 4.3.2")
+# Never the environment that the tests run in: the native module is in there without any zip.
 BLENDERS = (*(Blender(f"bpy {version}", CACHE / f"bpy-{version}") for version in ("4.2.23", "5.0.1", "5.2.3")), REAL)

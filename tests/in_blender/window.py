@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Run inside a Blender with a window: window.py ZIP FOLDER. Uses the extension as an artist does and takes shots.
+"""Run inside a Blender with a window: window.py ZIP SCENE FOLDER. Uses the extension as an artist does, with shots.
 
 FOLDER gets before.png, after.png and preview.png, and window.json: where the viewport, the sidebar and the overlay's
 boxes are in them, in pixels from the screen's lower left corner.
@@ -14,23 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import bpy
-import numpy as np
 
 NAME = "bl_ext.user_default.espalier"
 TICK_S = 0.25
 PATIENCE = 240  # ticks
-
-
-def add_terrain(side: int) -> None:
-    """A hilly grid of 2 side² triangles"""
-    steps = np.linspace(-3.0, 3.0, side + 1)
-    x, y = np.meshgrid(steps, steps)
-    vertices = np.stack([x, y, 0.5 * np.sin(2.0 * x) * np.cos(3.0 * y)], axis=-1).reshape(-1, 3)
-    corner = (np.arange(side)[:, None] * (side + 1) + np.arange(side)).ravel()
-    faces = np.stack([corner, corner + 1, corner + side + 2, corner + side + 1], axis=-1)
-    mesh = bpy.data.meshes.new("Terrain")
-    mesh.from_pydata(vertices.tolist(), [], faces.tolist())
-    bpy.context.collection.objects.link(bpy.data.objects.new("Terrain", mesh))
 
 
 def viewport() -> tuple[Any, Any]:
@@ -69,13 +56,17 @@ def steps(zip_file: str, folder: Path) -> Iterator[bool]:
     overlay = sys.modules[NAME + ".overlay"]
     session = sys.modules[NAME + ".session"]
     operators = sys.modules[NAME + ".operators"]
-    bpy.ops.object.select_all(action="DESELECT")
-    add_terrain(180)
     scene = bpy.context.scene
-    scene.render.resolution_x, scene.render.resolution_y = 160, 100
+    scene.render.resolution_percentage = 50
     window, area = viewport()
     space = area.spaces.active
     space.show_region_ui = True
+    space.shading.color_type = "MATERIAL"
+    space.overlay.show_extras = False
+    space.region_3d.view_perspective = "CAMERA"
+    view = region_of(area, "WINDOW")
+    with bpy.context.temp_override(window=window, area=area, region=view):
+        bpy.ops.view3d.view_center_camera()
     yield True
     sidebar = region_of(area, "UI")
     sidebar.active_panel_category = "Item"
@@ -104,7 +95,6 @@ def steps(zip_file: str, folder: Path) -> Iterator[bool]:
         blf.size(0, size)
         return float(blf.dimensions(0, text)[0])
 
-    view = region_of(area, "WINDOW")
     toolbar = region_of(area, "TOOLS").width if bpy.context.preferences.system.use_region_overlap else 0
     items = overlay.layout(
         session.last_report(scene, session.COMPARE),
@@ -133,7 +123,7 @@ def steps(zip_file: str, folder: Path) -> Iterator[bool]:
     yield from until(lambda: session.last_report(scene, session.PREVIEW) is not None, "the preview to end")
     yield from until(lambda: operators._Watched.running is None, "the operator to end")
     image = bpy.data.images["Espalier Preview"]
-    assert tuple(image.size) == (160, 100)
+    assert tuple(image.size) == (scene.render.resolution_x // 2, scene.render.resolution_y // 2)
     shown = [
         area
         for window in bpy.context.window_manager.windows
@@ -156,7 +146,10 @@ def until(condition: Any, what: str) -> Iterator[bool]:
 
 
 def main() -> None:
-    work = steps(sys.argv[-2], Path(sys.argv[-1]))
+    zip_file, scene, folder = sys.argv[-3:]
+    bpy.context.preferences.view.show_splash = False
+    bpy.ops.wm.open_mainfile(filepath=scene, load_ui=False)
+    work = steps(zip_file, Path(folder))
 
     def tick() -> float | None:
         try:
@@ -170,7 +163,6 @@ def main() -> None:
         bpy.ops.wm.quit_blender()
         return None
 
-    bpy.context.preferences.view.show_splash = False
     bpy.app.timers.register(tick, first_interval=2.0)
 
 
