@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 #include "kdtree/traversal.h"
 
+#include <algorithm>
 #include <bit>
 
 #include "geometry/float_environment.h"
@@ -129,13 +130,11 @@ HWY_INLINE bool meet_children(const BoxRay& ray, uint32_t octant, const WideNode
     return true;
 }
 
+/// Walks the ray through the tree, nearest children first. For any hit stops at the first and returns its block.
 template <bool kAnyHit>
-HWY_INLINE void trace(const Tree& tree, const Ray& ray, NearestHit& nearest) {
-    if (tree.wide_nodes.size() == 0) {
-        return;
-    }
+HWY_INLINE const TriangleBlock* trace(const Tree& tree, const Ray& ray, const ShearedRay& sheared,
+                                      NearestHit& nearest) {
     const BoxRay box_ray(ray);
-    const ShearedRay sheared(ray.origin, ray.direction);
     const uint32_t octant = box_ray.octant();
     const WideNode* nodes = tree.wide_nodes.data();
     const TriangleBlock* blocks = tree.blocks.data();
@@ -149,13 +148,13 @@ HWY_INLINE void trace(const Tree& tree, const Ray& ray, NearestHit& nearest) {
             const TriangleBlock* block = blocks + WideNode::first_block(child);
             for (const TriangleBlock* end = block + WideNode::blocks(child); block != end; ++block) {
                 if (test_block<kAnyHit>(ray, sheared, *block, nearest) && kAnyHit) {
-                    return;
+                    return block;
                 }
             }
         }
         do {
             if (stack.count == 0) {
-                return;
+                return nullptr;
             }
             --stack.count;
         } while (stack.distance[stack.count] > nearest.reach());
@@ -166,16 +165,20 @@ HWY_INLINE void trace(const Tree& tree, const Ray& ray, NearestHit& nearest) {
 void intersect(const Tree& tree, std::span<const Ray> rays, std::span<Hit> hits) {
     for (size_t i = 0; i < rays.size(); ++i) {
         NearestHit nearest(rays[i]);
-        trace<false>(tree, rays[i], nearest);
+        trace<false>(tree, rays[i], ShearedRay(rays[i].origin, rays[i].direction), nearest);
         hits[i] = nearest.result();
     }
 }
 
 void occluded(const Tree& tree, std::span<const Ray> rays, std::span<uint8_t> results) {
+    const TriangleBlock* blocker = nullptr;  // what hides one point from a light often hides the next
     for (size_t i = 0; i < rays.size(); ++i) {
+        const ShearedRay sheared(rays[i].origin, rays[i].direction);
         NearestHit nearest(rays[i]);
-        trace<true>(tree, rays[i], nearest);
-        results[i] = nearest.found() ? 1 : 0;
+        if (blocker == nullptr || !test_block<true>(rays[i], sheared, *blocker, nearest)) {
+            blocker = trace<true>(tree, rays[i], sheared, nearest);
+        }
+        results[i] = blocker != nullptr ? 1 : 0;
     }
 }
 
@@ -216,11 +219,19 @@ const TraceKernels& kernels() {
 
 void intersect(const Tree& tree, std::span<const Ray> rays, std::span<Hit> hits) {
     const FloatEnvironment environment;
+    if (tree.wide_nodes.size() == 0) {
+        std::transform(rays.begin(), rays.end(), hits.begin(), [](const Ray& ray) { return Hit{ray.t_max, 0, 0, -1}; });
+        return;
+    }
     kernels().intersect(tree, rays, hits);
 }
 
 void occluded(const Tree& tree, std::span<const Ray> rays, std::span<uint8_t> results) {
     const FloatEnvironment environment;
+    if (tree.wide_nodes.size() == 0) {
+        std::fill_n(results.begin(), rays.size(), uint8_t{0});
+        return;
+    }
     kernels().occluded(tree, rays, results);
 }
 
