@@ -166,7 +166,7 @@ class Builder {
             nodes = subtrees_[0].node_count;
             triangles = subtrees_[0].triangle_count;
         }
-        if (nodes > (1U << 30) || triangles / kBlockSize > (1U << 26)) {
+        if (nodes > (1U << 30) || triangles / kBlockSize > kMaxBlocks) {
             throw std::length_error("the tree needs more nodes or blocks than its indices can count");
         }
         tree_.nodes = LargeBuffer<KdNode>(nodes);

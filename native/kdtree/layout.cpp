@@ -108,6 +108,9 @@ class Collapse {
         }
         for (int i = 0; i < count; ++i) {
             const Item& child = items[static_cast<size_t>(i)];
+            if (child.blocks == 0 && is_empty(tree_, child.node)) {
+                continue;  // both halves of a split may have lost all they had; no ray meets the box of nothing
+            }
             if (child.blocks != 0 && child.blocks <= WideNode::kMaxLeafBlocks) {
                 made.child[i] = WideNode::leaf(child.first_block, child.blocks);
             } else if (const Run* run = child.blocks == 0 ? find_run(runs, child.node) : nullptr; run != nullptr) {
@@ -121,16 +124,16 @@ class Collapse {
     }
 
     /// The child of largest area that can be opened, or -1.
-    static int next_to_open(const std::array<Item, WideNode::kWidth>& items, int count, uint32_t root,
-                            const std::vector<Run>* runs) {
+    int next_to_open(const std::array<Item, WideNode::kWidth>& items, int count, uint32_t root,
+                     const std::vector<Run>* runs) const {
         if (count == WideNode::kWidth) {
             return -1;
         }
         int best = -1;
         for (int i = 0; i < count; ++i) {
             const Item& candidate = items[static_cast<size_t>(i)];
-            const bool is_inner =
-                candidate.blocks == 0 && (candidate.node == root || find_run(runs, candidate.node) == nullptr);
+            const bool is_inner = candidate.blocks == 0 && !is_empty(tree_, candidate.node) &&
+                                  (candidate.node == root || find_run(runs, candidate.node) == nullptr);
             const bool is_long_leaf = candidate.blocks > WideNode::kMaxLeafBlocks;
             if ((is_inner || is_long_leaf) && (best < 0 || candidate.area > items[static_cast<size_t>(best)].area)) {
                 best = i;

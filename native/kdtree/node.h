@@ -2,12 +2,16 @@
 #pragma once
 
 #include <bit>
+#include <cstddef>
 #include <cstdint>
 
 namespace espalier {
 
 /// Triangles are tested this many at a time, whatever the instruction set.
 constexpr uint32_t kBlockSize = 8;
+
+/// What the 26 bits of a wide leaf can count.
+constexpr size_t kMaxBlocks = size_t{1} << 26;
 
 /// Blocks that hold `references` triangles.
 constexpr uint32_t block_count(uint32_t references) { return (references + kBlockSize - 1) / kBlockSize; }

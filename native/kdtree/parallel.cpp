@@ -5,6 +5,7 @@
 #include <unistd.h>
 
 #include <memory>
+#include <system_error>
 #include <thread>
 #include <vector>
 
@@ -50,9 +51,9 @@ class Pool {
             body(context, 0);
             return;
         }
-        grow(threads - 1);
-        remaining_.store(threads - 1, std::memory_order_relaxed);
-        for (int i = 0; i < threads - 1; ++i) {
+        const int helpers = grow(threads - 1);
+        remaining_.store(helpers, std::memory_order_relaxed);
+        for (int i = 0; i < helpers; ++i) {
             Worker& worker = *workers_[static_cast<size_t>(i)];
             worker.body = body;
             worker.context = context;
@@ -67,12 +68,21 @@ class Pool {
     }
 
  private:
-    void grow(int count) {
+    /// Makes up to `count` workers; returns how many of them there are. A machine that gives no more threads gets on
+    /// with those it has.
+    int grow(int count) {
+        workers_.reserve(static_cast<size_t>(count));
         while (workers_.size() < static_cast<size_t>(count)) {
             const int index = static_cast<int>(workers_.size()) + 1;
-            workers_.push_back(std::make_unique<Worker>());
-            std::thread(&Pool::serve, this, workers_.back().get(), index).detach();
+            auto worker = std::make_unique<Worker>();
+            try {
+                std::thread(&Pool::serve, this, worker.get(), index).detach();
+            } catch (const std::system_error&) {
+                break;
+            }
+            workers_.push_back(std::move(worker));
         }
+        return std::min(count, static_cast<int>(workers_.size()));
     }
 
     void serve(Worker* worker, int index) {

@@ -59,7 +59,7 @@ void measure_quality(Tree& tree) {
     report.nodes = tree.nodes.size();
     report.wide_nodes = tree.wide_nodes.size();
     report.bytes = tree.nodes.bytes() + tree.wide_nodes.bytes() + tree.blocks.bytes();
-    const double area = half_area(tree.bounds);
+    const double area = tree.bounds.is_empty() ? 0 : half_area(tree.bounds);
     const double cost = add_cost(tree, 0, tree.bounds, report);
     report.sah_cost = area > 0 ? cost / area : 0;
 

@@ -15,6 +15,7 @@
 
 #include <bit>
 #include <cstring>
+#include <stdexcept>
 
 #include "kdtree/binning-inl.h"
 #include "kdtree/build_kernels.h"
@@ -27,6 +28,9 @@ namespace hn = hwy::HWY_NAMESPACE;
 class LeafWriter {
  public:
     explicit LeafWriter(SubtreeOutput& output, uint32_t references) : output_(output) {
+        if (output.triangles.size() / kBlockSize > kMaxBlocks) {
+            throw std::length_error("the tree needs more triangle blocks than its indices can count");
+        }
         const auto first = static_cast<uint32_t>(output.triangles.size());
         output.nodes.push_back(KdNode::leaf(first / kBlockSize, references));
         output.triangles.resize(first + size_t{block_count(references)} * kBlockSize, kNoTriangle);

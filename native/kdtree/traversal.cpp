@@ -38,8 +38,9 @@ struct BoxRay {
             negative[axis] = direction < 0;
             near_origin[axis] = far_origin[axis] = origin;
             if (direction == 0) {
-                // The ray stays in the slab or outside it: differences to a bound next to the origin, never zero, times
-                // infinity.
+                // The ray stays in the slab or outside it: a bound less a neighbour of the origin, times infinity.
+                // Where the bound is that neighbour the product is NaN; the ray then lies outside the slab, and it does
+                // not matter whether the axis counts.
                 near_origin[axis] = std::nextafter(origin, kInfinity);
                 far_origin[axis] = std::nextafter(origin, -kInfinity);
                 near_scale[axis] = far_scale[axis] = kInfinity;
@@ -58,9 +59,10 @@ struct BoxRay {
     uint32_t octant() const { return (negative[0] ? 1U : 0U) | (negative[1] ? 2U : 0U) | (negative[2] ? 4U : 0U); }
 };
 
-/// Nodes that still have to be visited. 56 levels of wide nodes cover the deepest kd-tree and its longest leaf.
+/// Nodes that still have to be visited. 70 levels of wide nodes cover the deepest kd-tree, 48 levels if each opens but
+/// its siblings, and below it the longest leaf, kMaxBlocks halved until parts of kMaxLeafBlocks are left.
 struct TraversalStack {
-    static constexpr int kCapacity = 56 * (WideNode::kWidth - 1) + 2 * WideNode::kWidth;
+    static constexpr int kCapacity = 70 * (WideNode::kWidth - 1) + 2 * WideNode::kWidth;
     uint32_t child[kCapacity];
     float distance[kCapacity];
     int count = 0;
@@ -97,7 +99,9 @@ HWY_INLINE bool meet_children(const BoxRay& ray, uint32_t octant, const WideNode
             const auto ranks = hn::Shr(hn::Set(du, node.order[octant]), hn::Mul(hn::Iota(du, 0), hn::Set(du, 3)));
             const auto order = hn::IndicesFromVec(d, hn::And(ranks, hn::Set(du, 7)));
             const auto child = hn::BitCast(du, hn::TableLookupLanes(hn::BitCast(d, hn::Load(du, node.child)), order));
-            const auto distance = hn::TableLookupLanes(hn::IfThenElse(meets, entry, hn::Inf(d)), order);
+            const auto distance = hn::TableLookupLanes(
+                hn::IfThenElse(meets, hn::Min(entry, hn::Set(d, std::numeric_limits<float>::max())), hn::Inf(d)),
+                order);
             const auto pushed = hn::Lt(distance, hn::Inf(d));
             uint8_t bits[8] = {};
             hn::StoreMaskBits(d, pushed, bits);

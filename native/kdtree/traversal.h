@@ -10,7 +10,8 @@
 namespace espalier {
 
 /// Points origin + t direction with t_min <= t <= t_max; 0 <= t_min. The direction need not have
-/// unit length, but its largest component must lie between 2^-100 and 2^100.
+/// unit length, but its largest component must lie between 2^-100 and 2^100, and no coordinate of the origin beyond
+/// 2^60.
 struct Ray {
     Vec3f origin;
     float t_min;

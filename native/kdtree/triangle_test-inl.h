@@ -15,6 +15,7 @@
 #include <bit>
 #include <cmath>
 #include <cstdint>
+#include <limits>
 
 #include "geometry/exact_hit.h"
 #include "kdtree/node.h"
@@ -75,7 +76,7 @@ class NearestHit {
             }
         }
         hit_ = candidate;
-        reach_ = static_cast<float>(hit_.t + hit_.error) * (1 + 0x1p-22F) + 0x1p-140F;
+        reach_ = round_to_float(hit_.t + hit_.error) * (1 + 0x1p-22F) + 0x1p-140F;
         return true;
     }
 
@@ -84,10 +85,16 @@ class NearestHit {
             return {ray_.t_max, 0, 0, -1};
         }
         finish_distance(ray_.origin, ray_.direction, hit_);
-        return {static_cast<float>(hit_.t), static_cast<float>(hit_.u), static_cast<float>(hit_.v), hit_.triangle};
+        return {round_to_float(hit_.t), static_cast<float>(hit_.u), static_cast<float>(hit_.v), hit_.triangle};
     }
 
  private:
+    /// Infinite beyond the largest float, where the language leaves a cast open.
+    static float round_to_float(double t) {
+        return t > double{std::numeric_limits<float>::max()} ? std::numeric_limits<float>::infinity()
+                                                             : static_cast<float>(t);
+    }
+
     const Ray& ray_;
     float reach_;
     ExactHit hit_{0, 0, 0, 0, {}, -1};
@@ -139,7 +146,7 @@ HWY_INLINE uint32_t possible_hits(const ShearedRay& sheared, const TriangleBlock
         }
         // The distance along z is the mean of the corners' z by weights u, v and w. Errors of the weights count by the
         // spread of the z, which is at most 2 mz; the rest is below 16 u mz, or underflow. Where the weights' sum is no
-        // larger than its error, any distance is possible.
+        // larger than its error, or so small that its reciprocal may overflow, any distance is possible.
         const V det = hn::Add(u, hn::Add(v, w));
         const V inverse = hn::Div(hn::Set(d, 1), det);
         const V mean = hn::Add(hn::Mul(hn::Mul(u, inverse), z[0]),
@@ -152,7 +159,7 @@ HWY_INLINE uint32_t possible_hits(const ShearedRay& sheared, const TriangleBlock
         const V t_error = hn::Mul(error, hn::Set(d, std::abs(sheared.sz)));
         const auto too_far = hn::Gt(hn::Sub(t, t_error), hn::Set(d, reach));
         const auto too_near = hn::Lt(hn::Add(t, t_error), hn::Set(d, t_min));
-        const auto ruled_out = hn::And(hn::Gt(sure, hn::Zero(d)), hn::Or(too_far, too_near));
+        const auto ruled_out = hn::And(hn::Gt(sure, hn::Set(d, 0x1p-120F)), hn::Or(too_far, too_near));
         uint8_t bits[8] = {};
         hn::StoreMaskBits(d, hn::AndNot(ruled_out, inside), bits);
         possible |= static_cast<uint32_t>(bits[0]) << first;

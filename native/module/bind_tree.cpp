@@ -7,6 +7,7 @@
 #include <memory>
 #include <vector>
 
+#include "geometry/triangle.h"
 #include "kdtree/parallel.h"
 #include "kdtree/traversal.h"
 #include "module/arrays.h"
@@ -95,6 +96,8 @@ class RayInput {
     static const char* fault(const Ray& ray) {
         if (!is_finite(ray.origin))
             return "origins is not finite";
+        if (largest_component(ray.origin) > kMaxCoordinate)
+            return "origins must not lie beyond 2^60";
         if (!is_finite(ray.direction))
             return "directions is not finite";
         const float size = largest_component(ray.direction);

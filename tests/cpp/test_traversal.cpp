@@ -147,6 +147,32 @@ TEST(Traversal, ClosedMeshIsWatertight) {
     EXPECT_EQ(std::count_if(hits.begin(), hits.end(), [](const Hit& hit) { return hit.triangle < 0; }), 0);
 }
 
+/// A triangle of any size right ahead, with a reach that has to be decided: products under- and overflow at the ends.
+TEST(Traversal, HitsTrianglesOfEverySize) {
+    for (int exponent = -140; exponent <= 58; ++exponent) {
+        const float s = std::ldexp(1.0F, exponent);
+        Mesh mesh;
+        mesh.add_triangle({-s, -s, 2 * s}, {s, -s, 2 * s}, {0, s, 2 * s});
+        mesh.add_triangle({-s, -s, s}, {s, -s, s}, {0, s, s});
+        const Tree tree = build(mesh.soup(), {});
+        for (const float length : {1.0F, 0x1p-90F, 0x1p90F}) {
+            if (!std::isnormal(s / length)) {
+                continue;  // the distance is no float
+            }
+            for (const float t_max : {s / length, INFINITY}) {
+                const Ray ray{{0, 0, 0}, 0, {0, 0, length}, t_max};
+                Hit hit{};
+                uint8_t blocked = 0;
+                intersect(tree, {&ray, 1}, {&hit, 1});
+                occluded(tree, {&ray, 1}, {&blocked, 1});
+                EXPECT_EQ(hit.triangle, 1) << exponent << ' ' << length << ' ' << t_max;
+                EXPECT_EQ(hit.t, s / length);
+                EXPECT_EQ(blocked, 1);
+            }
+        }
+    }
+}
+
 TEST(Traversal, BarycentricsNameTheCorners) {
     Mesh mesh;
     mesh.add_triangle({0, 0, 0}, {4, 0, 0}, {0, 4, 0});

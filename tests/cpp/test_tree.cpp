@@ -172,6 +172,7 @@ TEST(Tree, TakesMeshesOfAlmostNothing) {
             const Mesh mesh = make_soup(count, 5);
             const Tree tree = build(mesh.soup(), {Quality::kBalanced, threads});
             EXPECT_EQ(tree.report.references, count);
+            EXPECT_TRUE(std::isfinite(tree.report.sah_cost));
             expect_well_formed(tree);
             const Ray ray{{0.5F, 0.5F, 5}, 0, {0, 0, 1}, INFINITY};
             Hit hit{};
