@@ -286,6 +286,7 @@ def test_build_refuses_unknown_settings() -> None:
         (f32(3), f32(1, 3), {}, ValueError, "origins must have shape"),
         (f32(2, 3), f32(1, 3), {}, ValueError, "directions must have as many rows as origins"),
         (*ray((0, np.nan, 0), (0, 0, 1)), {}, ValueError, "ray 0: origins is not finite"),
+        (*ray((0, 2.0**61, 0), (0, 0, 1)), {}, ValueError, "ray 0: origins must not lie beyond"),
         (*ray((0, 0, 0), (0, np.inf, 1)), {}, ValueError, "ray 0: directions is not finite"),
         (*ray((0, 0, 0), (0, 0, 0)), {}, ValueError, "ray 0: directions is zero"),
         (*ray((0, 0, 0), (0, 1e-38, 0)), {}, ValueError, "ray 0: directions must have its largest component"),
