@@ -31,6 +31,12 @@ TYPES_WITHOUT_TRIANGLES = {
     "GPENCIL": "Grease Pencil strokes",
 }
 
+# Objects whose faces the viewport does not draw, in solid and in rendered shading; a final render draws them.
+DISPLAYED_WITHOUT_FACES = {
+    "WIRE": "faces of an object displayed as wire",
+    "BOUNDS": "faces of an object displayed as bounds",
+}
+
 Color = tuple[float, float, float]
 
 
@@ -94,7 +100,7 @@ class SceneArrays:
     lights: list[dict[str, Any]] = field(default_factory=list)
     world_color: Color = BLACK
     not_finite: dict[str, int] = field(default_factory=dict)  # faces left out, by object
-    left_out: dict[str, str] = field(default_factory=dict)  # object: what of it has no triangles
+    left_out: dict[str, str] = field(default_factory=dict)  # object: what of it is not drawn
     evaluation_ms: float = 0.0
     export_ms: float = 0.0
 
@@ -261,11 +267,18 @@ class _InstanceReader:
             kind = instance.object.type
             # Text, curves, surfaces and metaballs come a second time, as the mesh that is drawn.
             if kind == "MESH":
-                self.place(instance)
+                # An instance has the lesser display type of its object and of what makes it.
+                display = instance.object.display_type if arrays.settings_used == "viewport" else ""
+                if display in DISPLAYED_WITHOUT_FACES:
+                    arrays.left_out[instance.object.name] = DISPLAYED_WITHOUT_FACES[display]
+                else:
+                    self.place(instance)
             elif kind == "LIGHT":
                 matrix = np.array(instance.matrix_world, np.float64)
                 if np.isfinite(matrix).all():
                     arrays.lights.append(export_light(instance.object.data, matrix))
+                else:
+                    arrays.left_out[instance.object.name] = "lights at no finite place"
             elif kind in TYPES_WITHOUT_TRIANGLES:
                 arrays.left_out[instance.object.name] = TYPES_WITHOUT_TRIANGLES[kind]
         flat = itertools.chain.from_iterable(itertools.chain.from_iterable(self.matrices))
@@ -469,7 +482,9 @@ def _rgb(color: Sequence[float]) -> Color:
 
 
 def _color_socket(node: bpy.types.Node) -> bpy.types.NodeSocket | None:
-    return node.inputs.get("Base Color") or node.inputs.get("Color")
+    # A node group may call any kind of socket so.
+    colors = [socket for socket in node.inputs if socket.type == "RGBA"]
+    return next((socket for name in ("Base Color", "Color") for socket in colors if socket.name == name), None)
 
 
 def _surface_node(owner: bpy.types.ID, types: set[str] | None) -> bpy.types.Node | None:

@@ -181,6 +181,32 @@ def test_what_has_no_triangles_is_named(stage: Stage) -> None:
     assert stage.export().left_out == {"Fur": "hair curves", "Smoke": "volumes"}
 
 
+def test_what_the_viewport_shows_as_wire_or_bounds_is_named_and_left_to_the_render(stage: Stage) -> None:
+    cutter = stage.cube("Cutter", display_type="WIRE")
+    stage.cube("Box", display_type="BOUNDS")
+    hollow = stage.cube("Hollow", display_type="SOLID")
+    hole = hollow.modifiers.new("Hole", "BOOLEAN")
+    hole.object, cutter.location = cutter, (1.0, 0.0, 0.0)
+    inside = collection_of(stage, "Inside", stage.cube("Instanced"))
+    stage.add("Ghosts", None, instance_type="COLLECTION", instance_collection=inside, display_type="WIRE")
+    label = stage.bpy.data.curves.new("Label", "FONT")
+    label.body = "A"
+    stage.add("Label", label, display_type="WIRE")
+    arrays = stage.export()
+    assert set(triangles_of(arrays)) == {"Hollow"}
+    assert set(arrays.left_out) == {"Cutter", "Box", "Instanced", "Label"}
+    assert arrays.left_out["Cutter"] == "faces of an object displayed as wire"
+    assert arrays.left_out["Box"] == "faces of an object displayed as bounds"
+
+
+def test_a_light_at_no_finite_place_is_named(stage: Stage) -> None:
+    for name, x in (("Lamp", 1.0), ("Lost", nan)):
+        stage.add(name, stage.bpy.data.lights.new(name, "POINT"), location=(x, 0.0, 0.0))
+    arrays = stage.export()
+    assert len(arrays.lights) == 1
+    assert arrays.left_out == {"Lost": "lights at no finite place"}
+
+
 def test_a_concave_face_is_cut_along_blenders_own_diagonals(stage: Stage) -> None:
     arrow = [(0, 0, 0), (4, 0, 0), (4, 4, 0), (2, 1, 0), (0, 4, 1)]
     stage.add("Arrow", stage.mesh("Arrow", arrow, [(0, 1, 2, 3, 4)]))
@@ -336,6 +362,29 @@ def test_materials_by_slot_and_by_object(stage: Stage) -> None:
     assert meshes["Bare"].material_slots is None
 
 
+@pytest.mark.parametrize("kind", ["NodeSocketFloat", "NodeSocketVector", "NodeSocketShader"])
+@pytest.mark.parametrize("name", ["Color", "Base Color"])
+def test_a_group_socket_that_is_called_a_colour_is_none(stage: Stage, name: str, kind: str) -> None:
+    from addon.export import base_color
+
+    material = stage.material("Grouped", (0.1, 0.2, 0.3))
+    material.diffuse_color = (0.5, 0.6, 0.7, 1.0)
+    nodes = material.node_tree.nodes
+    nodes.remove(next(node for node in nodes if node.type == "BSDF_PRINCIPLED"))
+    inner = stage.bpy.data.node_groups.new("Inner", "ShaderNodeTree")
+    inner.interface.new_socket("Shader", in_out="OUTPUT", socket_type="NodeSocketShader")
+    inner.interface.new_socket(name, in_out="INPUT", socket_type=kind)
+    group = nodes.new("ShaderNodeGroup")
+    group.node_tree = inner
+    output = next(node for node in nodes if node.type == "OUTPUT_MATERIAL")
+    material.node_tree.links.new(group.outputs["Shader"], output.inputs["Surface"])
+    assert base_color(material) == pytest.approx((0.5, 0.6, 0.7))
+
+    inner.interface.new_socket(name, in_out="INPUT", socket_type="NodeSocketColor")
+    group.inputs[1].default_value = (0.9, 0.8, 0.7, 1.0)
+    assert base_color(material) == pytest.approx((0.9, 0.8, 0.7))
+
+
 def test_base_colours(stage: Stage) -> None:
     from addon.export import base_color
 
@@ -486,6 +535,7 @@ def test_render_settings_are_used_and_said_when_the_render_engine_exports(stage:
     modifier.levels, modifier.render_levels = 0, 2
     stage.cube("Viewport only", hide_render=True)
     stage.cube("Render only", hide_viewport=True)
+    stage.cube("Wire", display_type="WIRE")
     stage.camera()
     bpy.utils.register_class(Witness)
     try:
@@ -495,5 +545,6 @@ def test_render_settings_are_used_and_said_when_the_render_engine_exports(stage:
         bpy.utils.unregister_class(Witness)
     (arrays,) = seen
     assert arrays.settings_used == "render"
-    assert triangles_of(arrays) == {"Detailed": 192, "Render only": 12}
+    assert triangles_of(arrays) == {"Detailed": 192, "Render only": 12, "Wire": 12}
+    assert not arrays.left_out
     assert triangles_of(stage.export()) == {"Detailed": 12, "Viewport only": 12}
