@@ -83,8 +83,8 @@ class Builder {
             phases.bounds = watch.lap();
             tree_.report.rejected_faces = top.rejected();
             tree_.bounds = top.nodes()[0].node.cell;
-            // Eight subtrees a thread even out their different costs.
-            top.split_above(soup_.size() / (8 * static_cast<uint32_t>(threads_)));
+            // Six subtrees a thread even out their different costs.
+            top.split_above(soup_.size() / (6 * static_cast<uint32_t>(threads_)));
             list_subtrees();
             phases.top_levels = watch.lap();
         }

@@ -8,9 +8,11 @@
 namespace espalier {
 namespace {
 
-/// Small enough to share out among many threads, large enough that a segment is still worth a vector loop a few levels
-/// down.
-uint32_t choose_segment_size(uint32_t triangles) { return std::clamp<uint32_t>(triangles / 64, 1024, 8192); }
+/// Small enough to share out among the threads, large enough that a segment is still worth a vector loop a few levels
+/// down. down.
+uint32_t choose_segment_size(uint32_t triangles, int threads) {
+    return std::clamp<uint32_t>(triangles / (16 * static_cast<uint32_t>(threads)), 1024, 8192);
+}
 
 /// Segments keep a quarter of their size free, so that most right halves fit behind their left ones although straddlers
 /// go to both. Vector code may touch up to kMargin items behind the last one, which must then be no other segment's.
@@ -45,7 +47,7 @@ TopLevels::TopLevels(const TriangleSoup& soup, const BuildParameters& parameters
       cancel_(cancel),
       threads_(threads),
       kernels_(build_kernels()),
-      segment_size_(choose_segment_size(soup.size())),
+      segment_size_(choose_segment_size(soup.size(), threads)),
       memory_(size_t{2} * soup.size() + 2 * with_slack(segment_size_)) {}
 
 void TopLevels::make_references() {
