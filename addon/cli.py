@@ -24,12 +24,19 @@ MAX_THREADS = 1024
 _handle: Any = None
 
 
-def main(argv: Sequence[str]) -> int:
+def command(argv: Sequence[str]) -> int:
+    """What `blender -c espalier` runs: main(), but Blender's start-up scene is not drawn for a file it cannot open."""
+    return main(argv, needs_file=True)
+
+
+def main(argv: Sequence[str], *, needs_file: bool = False) -> int:
     """Run the command and return its exit code: 0 done, 1 failed, 2 bad arguments. Never leaves by an exception."""
     try:
         arguments = _parser().parse_args(list(argv))
     except SystemExit as leaving:  # argparse leaves the interpreter, which would be Blender
         return leaving.code if isinstance(leaving.code, int) else BAD_ARGUMENTS
+    if needs_file and arguments.scene is None and not Path(bpy.data.filepath).is_file():
+        return _fail("no file is open: name one that exists, `blender -b FILE -c espalier …`, or a SCENE")
     try:
         return preview(arguments)
     except (KeyboardInterrupt, Cancelled):
@@ -121,7 +128,7 @@ def frame_scene(context: bpy.types.Context) -> None:
 def register() -> None:
     """Make `blender -c espalier` known."""
     global _handle  # noqa: PLW0603  Blender wants it back
-    _handle = bpy.utils.register_cli_command("espalier", main)
+    _handle = bpy.utils.register_cli_command("espalier", command)
 
 
 def unregister() -> None:
