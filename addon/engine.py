@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import bpy
 import numpy as np
@@ -39,7 +40,8 @@ class ESPALIER_engine(bpy.types.RenderEngine):
 
     def _draw_frame(self, depsgraph: bpy.types.Depsgraph) -> None:
         self.update_stats("", "Exporting")
-        run = Run(depsgraph, options_of(depsgraph.scene))
+        # Blender made room for the scene's own resolution; the other one is the preview's alone.
+        run = Run(depsgraph, replace(options_of(depsgraph.scene), percentage=None))
         x0, y0, x1, y1 = shown_part(depsgraph.scene.render, *run.size)
         target = self.begin_result(0, 0, x1 - x0, y1 - y0, layer=depsgraph.view_layer.name)
         try:

@@ -300,6 +300,14 @@ def test_f12_draws_the_same_picture_with_render_settings(addon: ModuleType, cube
     np.testing.assert_allclose(finished(run_of(cube, samples=2)).image, drawn, atol=1e-6)
 
 
+def test_f12_keeps_the_scenes_resolution(addon: ModuleType, cube: Stage, tmp_path: Path) -> None:
+    cube.scene.render.engine = "ESPALIER"
+    whole = rendered(cube, tmp_path / "whole.exr")
+    for percentage in (50, 200):
+        cube.scene.espalier.use_percentage, cube.scene.espalier.percentage = True, percentage
+        np.testing.assert_array_equal(rendered(cube, tmp_path / f"{percentage}.exr"), whole)
+
+
 @pytest.mark.parametrize("crop", [False, True])
 def test_f12_shows_only_the_render_region(addon: ModuleType, cube: Stage, tmp_path: Path, crop: bool) -> None:
     cube.scene.render.engine = "ESPALIER"
