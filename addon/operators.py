@@ -17,10 +17,11 @@ class _Watched:
     """What both operators do: start, tick, end; in background, all of it in one go."""
 
     kind: ClassVar[str]
-    running: ClassVar[_Watched | None] = None  # one at a time, for the cores are shared
+    # One at a time, for the cores are shared. Not the operator: Blender frees that whenever it likes.
+    running: ClassVar[Session | None] = None
+    timer: ClassVar[bpy.types.Timer | None] = None
 
     session: Session
-    timer: bpy.types.Timer
     outcome: set[str] | None  # None: still at work
     to_fit: bool  # an image editor was made, and has no size before it is drawn
 
@@ -47,14 +48,22 @@ class _Watched:
             return self.execute(context)
         if not self.begin(context):
             return {"CANCELLED"}
-        _Watched.running = self
         manager = context.window_manager
-        self.timer = manager.event_timer_add(TICK_S, window=context.window)
+        _Watched.running = self.session
+        _Watched.timer = manager.event_timer_add(TICK_S, window=context.window)
         manager.progress_begin(0, 100)
         manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        try:
+            return self.step(context, event)
+        except Exception as error:  # left alone, it would end the operator and nothing else
+            self.report({"ERROR"}, str(error) or type(error).__name__)  # type: ignore[attr-defined]
+            self.cancel(context)
+            return {"CANCELLED"}
+
+    def step(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         if event.type == "ESC" and event.value == "PRESS" and self.outcome is None:
             self.cancel(context)
             self.report({"INFO"}, "Cancelled: the last picture is still there")  # type: ignore[attr-defined]
@@ -70,14 +79,13 @@ class _Watched:
             self.to_fit = False
         if self.outcome is None or self.to_fit:
             return {"PASS_THROUGH"}
-        self.tidy(context)
+        tidy(context)
         return self.outcome
 
     def cancel(self, context: bpy.types.Context) -> None:
         """Blender calls this too, when the window closes or another file is opened."""
-        self.tidy(context)
-        if self.outcome is None:
-            self.session.cancel()
+        tidy(context)
+        self.session.cancel()
 
     def begin(self, context: bpy.types.Context) -> bool:
         self.outcome = None
@@ -102,15 +110,6 @@ class _Watched:
         if self.to_fit:
             picture.fit(context, image)
         self.to_fit = picture.open_editor(context, image)
-
-    def tidy(self, context: bpy.types.Context) -> None:
-        _Watched.running = None
-        manager = context.window_manager
-        manager.event_timer_remove(self.timer)
-        manager.progress_end()
-        if context.workspace is not None:
-            context.workspace.status_text_set(None)
-        redraw(context)
 
     def end(self, context: bpy.types.Context) -> set[str]:
         try:
@@ -139,7 +138,13 @@ class ESPALIER_OT_preview(_Watched, bpy.types.Operator):
 
     def present(self, context: bpy.types.Context) -> None:
         """Open the picture"""
-        self.show(context, bpy.data.images[picture.NAME])
+        if self.session.first_picture:
+            # Else undoing what the artist does next would take the picture away with it.
+            bpy.ops.ed.undo_push(message="Espalier Preview")
+        image = bpy.data.images[picture.NAME]
+        self.show(context, image)
+        if not picture.is_shown(context, image):
+            self.report({"INFO"}, f"The picture is the image “{picture.NAME}”: no area can be split to show it")
 
 
 class ESPALIER_OT_compare(_Watched, bpy.types.Operator):
@@ -182,7 +187,19 @@ class ESPALIER_OT_overlay(bpy.types.Operator):
 
 def at_work() -> Session | None:
     """The run that is being watched now."""
-    return None if _Watched.running is None else _Watched.running.session
+    return _Watched.running
+
+
+def tidy(context: bpy.types.Context) -> None:
+    """Let go of the window: no timer, no progress, no status; another run may start."""
+    timer, _Watched.running, _Watched.timer = _Watched.timer, None, None
+    manager = context.window_manager
+    if timer is not None:
+        manager.event_timer_remove(timer)
+    manager.progress_end()
+    if context.workspace is not None:
+        context.workspace.status_text_set(None)
+    redraw(context)
 
 
 def regions(context: bpy.types.Context, area_type: str, region_type: str) -> list[bpy.types.Region]:
@@ -214,7 +231,8 @@ def register() -> None:
 
 def unregister() -> None:
     """End what is at work, then take the operators away."""
-    if _Watched.running is not None:
-        _Watched.running.cancel(bpy.context)
+    if (session := at_work()) is not None:
+        tidy(bpy.context)
+        session.cancel()
     for cls in reversed(classes):
         bpy.utils.unregister_class(cls)

@@ -32,6 +32,11 @@ def show(pixels: Pixels) -> bpy.types.Image:
     return image
 
 
+def exists() -> bool:
+    """Whether there is a picture's datablock already."""
+    return NAME in bpy.data.images
+
+
 def remember() -> Pixels | None:
     """A copy of the picture that is shown now, for restore()."""
     image = bpy.data.images.get(NAME)
@@ -91,16 +96,25 @@ def open_editor(context: bpy.types.Context, image: bpy.types.Image) -> bool:
         return False
     # Not in a window of its own: that would take the keyboard, and Esc would not reach the operator.
     screen = context.window.screen
+    if screen.show_fullscreen:  # a maximised area cannot be split
+        return False
     areas = [area for area in screen.areas if area.type == "VIEW_3D"] or list(screen.areas)
     widest = max(areas, key=lambda area: area.width * area.height)
     before = set(screen.areas)
     with context.temp_override(area=widest, region=_window_region(widest)):
+        if not bpy.ops.screen.area_split.poll():
+            return False
         bpy.ops.screen.area_split(direction="VERTICAL", factor=0.5)
     made = set(screen.areas) - before
     for area in made:
         area.ui_type = "IMAGE_EDITOR"
         area.spaces.active.image = image
     return bool(made)
+
+
+def is_shown(context: bpy.types.Context, image: bpy.types.Image) -> bool:
+    """Whether an image editor that is open shows the image."""
+    return any(area.spaces.active.image == image for _, area in _editors(context))
 
 
 def fit(context: bpy.types.Context, image: bpy.types.Image) -> None:

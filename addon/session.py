@@ -45,6 +45,8 @@ class Session:
             evaluation_ms=evaluation_ms,
         )
         self._before = picture.remember() if kind == PREVIEW else None
+        self.first_picture = kind == PREVIEW and not picture.exists()
+        self._ended = False
         self._next_look = 0.0
 
     @property
@@ -66,6 +68,7 @@ class Session:
 
     def finish(self) -> Report:
         """The report of a run that is done. Raises Cancelled or the run's error, the last good picture restored."""
+        self._ended = True
         try:
             result = self.run.result()
             if result.image is not None:
@@ -77,7 +80,10 @@ class Session:
         return result.report
 
     def cancel(self) -> None:
-        """Stop the run, wait for its end, and put the last good picture back."""
+        """Stop the run, wait for its end, and put the last good picture back; nothing after finish()."""
+        if self._ended:
+            return
+        self._ended = True
         self.run.cancel()
         while not self.run.wait(1.0):
             pass

@@ -137,6 +137,22 @@ def steps(zip_file: str, folder: Path) -> Iterator[bool]:
     yield True
     shoot(folder / "preview.png")
 
+    # Maximised, the viewport cannot be split: the picture is drawn all the same.
+    window, area = viewport()
+    with bpy.context.temp_override(window=window, area=area, region=region_of(area, "WINDOW")):
+        bpy.ops.screen.screen_full_area()
+    yield True
+    yield True
+    window, area = viewport()
+    assert window.screen.show_fullscreen
+    before = session.last_report(scene, session.PREVIEW)
+    with bpy.context.temp_override(window=window, area=area, region=region_of(area, "WINDOW")):
+        assert bpy.ops.espalier.preview("INVOKE_DEFAULT") == {"RUNNING_MODAL"}
+    yield from until(lambda: operators._Watched.running is None, "the operator to end in a maximised viewport")
+    assert session.last_report(scene, session.PREVIEW) is not before
+    assert len(window.screen.areas) == 1
+    assert bpy.ops.espalier.preview.poll()
+
 
 def until(condition: Any, what: str) -> Iterator[bool]:
     for _ in range(PATIENCE):
