@@ -30,13 +30,14 @@ struct Slices {
     }
 };
 
-/// Where plane j of `slices` cuts [lower, upper]; the ends exactly.
-inline float slice_position(float lower, float upper, int j, int slices) {
-    if (j == 0) {
-        return lower;
-    }
-    return j == slices ? upper
-                       : lower + (upper - lower) * (static_cast<float>(j) * (1.0F / static_cast<float>(slices)));
+/// Where planes `first` and following of `slices` cut [lower, upper]; the ends exactly.
+template <class D>
+HWY_INLINE hn::Vec<D> slice_positions(D d, float lower, float upper, int first, int slices) {
+    const hn::RebindToSigned<D> di;
+    const auto plane = hn::Iota(di, first);
+    const auto fraction = hn::Mul(hn::ConvertTo(d, plane), hn::Set(d, 1.0F / static_cast<float>(slices)));
+    const auto between = hn::Add(hn::Set(d, lower), hn::Mul(hn::Set(d, upper - lower), fraction));
+    return hn::IfThenElse(hn::RebindMask(d, hn::Eq(plane, hn::Set(di, slices))), hn::Set(d, upper), between);
 }
 
 /// A count that no node reaches, small enough for signed comparison.
@@ -152,15 +153,12 @@ inline Split choose_split(const OpenNode& node, BinCounts& counts, const BuildPa
         counts.left[axis][bins] = counts.right[axis][0] = node.count;
         const auto last = hn::Set(di, bins);
         for (int j = 0; j <= bins; j += static_cast<int>(hn::Lanes(d))) {
-            const auto plane = hn::Iota(di, j);
-            const auto fraction = hn::Mul(hn::ConvertTo(d, plane), hn::Set(d, 1.0F / static_cast<float>(bins)));
-            const auto between = hn::Add(hn::Set(d, lower), hn::Mul(hn::Set(d, upper - lower), fraction));
-            const auto position = hn::IfThenElse(hn::RebindMask(d, hn::Eq(plane, last)), hn::Set(d, upper), between);
+            const auto position = slice_positions(d, lower, upper, j, bins);
             const auto left = hn::Load(du, counts.left[axis] + j);
             const auto right = hn::Load(du, counts.right[axis] + j);
             const auto cost = costs(axis, position, expected_blocks(d, left), expected_blocks(d, right));
             const auto counts_as =
-                hn::AndNot(hn::Gt(plane, last), hn::Lt(hn::BitCast(di, hn::Add(left, right)), too_many));
+                hn::AndNot(hn::Gt(hn::Iota(di, j), last), hn::Lt(hn::BitCast(di, hn::Add(left, right)), too_many));
             cheapest.offer(axis * (bins + 1) + j, hn::IfThenElse(hn::RebindMask(d, counts_as), cost, hn::Inf(d)));
         }
     }
@@ -170,7 +168,9 @@ inline Split choose_split(const OpenNode& node, BinCounts& counts, const BuildPa
         return {};
     }
     const int axis = cheapest.index() / (bins + 1);
-    return {axis, slice_position(node.tight.lower[axis], node.tight.upper[axis], cheapest.index() % (bins + 1), bins)};
+    const auto position =
+        slice_positions(d, node.tight.lower[axis], node.tight.upper[axis], cheapest.index() % (bins + 1), bins);
+    return {axis, hn::GetLane(position)};
 }
 
 }  // namespace espalier::HWY_NAMESPACE

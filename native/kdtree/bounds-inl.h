@@ -17,24 +17,15 @@ HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
 namespace hn = hwy::HWY_NAMESPACE;
 
-/// Writes the reference of one face that passed or failed as `fault` says.
+/// Writes the reference of one face, or counts why it has none.
 inline void make_reference(const TriangleSoup& soup, uint32_t triangle, const References& out, uint32_t& count,
                            RejectedFaces& rejected) {
     const Vec3f v0 = soup.vertex(triangle, 0);
     const Vec3f v1 = soup.vertex(triangle, 1);
     const Vec3f v2 = soup.vertex(triangle, 2);
-    switch (classify_face(v0, v1, v2)) {
-        case FaceFault::kNotFinite:
-            ++rejected.not_finite;
-            return;
-        case FaceFault::kTooLarge:
-            ++rejected.too_large;
-            return;
-        case FaceFault::kNoArea:
-            ++rejected.no_area;
-            return;
-        case FaceFault::kNone:
-            break;
+    if (const FaceFault fault = classify_face(v0, v1, v2); fault != FaceFault::kNone) {
+        rejected.count(fault);
+        return;
     }
     for (size_t axis = 0; axis < 3; ++axis) {
         const int a = static_cast<int>(axis);

@@ -59,9 +59,7 @@ class SubtreeBuilder {
         OpenNode right;
         open_children(node, split, parts, left, right);
 
-        const size_t index = output_.nodes.size();
-        output_.nodes.push_back(KdNode::leaf(0, 0));
-        output_.boxes.emplace_back();
+        const size_t index = output_.open_inner();
         build(left, begin, right_room);
         if (right_begin != begin && right_room + right.count > input_.references->capacity()) {
             copy_references(at(right_begin), right.count, references);  // the parent's place is free
@@ -70,10 +68,7 @@ class SubtreeBuilder {
         }
         const size_t right_child = output_.nodes.size();
         build(right, right_begin, right_room);
-        output_.nodes[index] = KdNode::inner(split.axis, split.position, static_cast<uint32_t>(right_child));
-        Box3f box = output_.boxes[index + 1];
-        box.extend(output_.boxes[right_child]);
-        output_.boxes[index] = box;
+        output_.close_inner(index, split, right_child);
     }
 
  private:

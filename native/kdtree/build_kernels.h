@@ -54,6 +54,20 @@ struct SubtreeOutput {
     std::vector<KdNode> nodes;
     std::vector<Box3f> boxes;         ///< tight, per node
     std::vector<uint32_t> triangles;  ///< kBlockSize per block, padded with kNoTriangle
+
+    /// Takes the place of an inner node, before its left child is written; returns its index.
+    size_t open_inner() {
+        nodes.push_back(KdNode::leaf(0, 0));
+        boxes.emplace_back();
+        return nodes.size() - 1;
+    }
+    /// Fills it in when both children are there.
+    void close_inner(size_t index, Split split, size_t right_child) {
+        nodes[index] = KdNode::inner(split.axis, split.position, static_cast<uint32_t>(right_child));
+        Box3f box = boxes[index + 1];
+        box.extend(boxes[right_child]);
+        boxes[index] = box;
+    }
 };
 
 /// What one thread needs while it builds a subtree.

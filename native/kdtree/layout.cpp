@@ -17,8 +17,6 @@ namespace {
 struct Run {
     uint32_t begin;
     uint32_t end;
-    uint32_t first_block;
-    uint32_t end_block;
     std::vector<WideNode> wide;
     uint32_t first_wide = 0;
 };
@@ -193,7 +191,7 @@ void find_runs(const Tree& tree, uint32_t begin, uint32_t end, uint32_t longest,
         return;  // the node above takes it as it is
     }
     if (end - begin <= longest) {
-        runs.push_back({begin, end, 0, 0, {}});
+        runs.push_back({begin, end, {}});
         return;
     }
     find_runs(tree, begin + 1, node.right_child(), longest, runs);

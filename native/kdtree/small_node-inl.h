@@ -96,13 +96,9 @@ class SmallNode {
             q.begin[i] = kPlanes;
             q.end[i] = 0;
         }
-        for (int j = 0; j < kPlanes; j += static_cast<int>(hn::Lanes(df))) {  // as in slice_position
-            const hn::RebindToSigned<decltype(df)> di;
-            const auto fraction =
-                hn::Mul(hn::ConvertTo(df, hn::Iota(di, j)), hn::Set(df, 1.0F / static_cast<float>(kSlices)));
-            hn::Store(hn::Add(hn::Set(df, lower), hn::Mul(hn::Set(df, upper - lower), fraction)), df, positions + j);
+        for (int j = 0; j < kPlanes; j += static_cast<int>(hn::Lanes(df))) {
+            hn::Store(slice_positions(df, lower, upper, j, kSlices), df, positions + j);
         }
-        positions[kSlices] = upper;
         for (int j = 0; j < kPlanes; ++j) {
             uint64_t begins_before = 0;
             uint64_t ends_behind = 0;
@@ -187,10 +183,8 @@ class SmallNode {
         OpenNode right;
         open_children(node, split_at, parts, left, right);
 
-        const size_t index = output_.nodes.size();
         const size_t first_triangle = output_.triangles.size();
-        output_.nodes.push_back(KdNode::leaf(0, 0));
-        output_.boxes.emplace_back();
+        const size_t index = output_.open_inner();
         const float left_cost = split(left_members, left);
         const size_t right_child = output_.nodes.size();
         const float right_cost = split(right_members, right);
@@ -205,10 +199,7 @@ class SmallNode {
             write_leaf(members, node);
             return leaf_cost;
         }
-        output_.nodes[index] = KdNode::inner(split_at.axis, split_at.position, static_cast<uint32_t>(right_child));
-        Box3f box = output_.boxes[index + 1];
-        box.extend(output_.boxes[right_child]);
-        output_.boxes[index] = box;
+        output_.close_inner(index, split_at, right_child);
         return cost;
     }
 

@@ -9,7 +9,7 @@ namespace espalier {
 namespace {
 
 /// Small enough to share out among the threads, large enough that a segment is still worth a vector loop a few levels
-/// down. down.
+/// down.
 uint32_t choose_segment_size(uint32_t triangles, int threads) {
     return std::clamp<uint32_t>(triangles / (16 * static_cast<uint32_t>(threads)), 1024, 8192);
 }
@@ -71,9 +71,7 @@ void TopLevels::make_references() {
     for (size_t i = 0; i < count; ++i) {
         box.extend(bounds[i]);
         valid += root.segments[i].count;
-        rejected_.not_finite += rejected[i].not_finite;
-        rejected_.too_large += rejected[i].too_large;
-        rejected_.no_area += rejected[i].no_area;
+        rejected_ += rejected[i];
     }
     root.node = {box, box, valid, spare_references(triangles), 0};
     nodes_.push_back(std::move(root));

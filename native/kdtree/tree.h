@@ -6,6 +6,7 @@
 #include <span>
 #include <stdexcept>
 
+#include "geometry/triangle.h"
 #include "geometry/vec.h"
 #include "kdtree/large_buffer.h"
 #include "kdtree/node.h"
@@ -40,6 +41,18 @@ struct RejectedFaces {
     uint64_t not_finite = 0;
     uint64_t too_large = 0;
     uint64_t no_area = 0;
+
+    void count(FaceFault fault) {
+        not_finite += fault == FaceFault::kNotFinite ? 1 : 0;
+        too_large += fault == FaceFault::kTooLarge ? 1 : 0;
+        no_area += fault == FaceFault::kNoArea ? 1 : 0;
+    }
+    RejectedFaces& operator+=(const RejectedFaces& other) {
+        not_finite += other.not_finite;
+        too_large += other.too_large;
+        no_area += other.no_area;
+        return *this;
+    }
 };
 
 /// Wall-clock milliseconds of each phase of a build, in the order in which they run.

@@ -22,6 +22,11 @@ py::dict phases_dict(const PhaseTimes& phases) {
                     "compaction"_a = phases.compaction, "layout"_a = phases.layout);
 }
 
+py::dict rejected_dict(const RejectedFaces& rejected) {
+    return py::dict("not_finite"_a = rejected.not_finite, "no_area"_a = rejected.no_area,
+                    "too_large"_a = rejected.too_large);
+}
+
 py::dict row_dict(const CompareRow& row, const CompareRow& serial, int repeats) {
     const BuildReport& report = row.report;
     py::dict result = report_dict(report);
@@ -51,26 +56,21 @@ Quality quality_from(const std::string& name) {
 
 py::dict report_dict(const BuildReport& report) {
     const SahConstants& sah = report.sah_constants;
-    const RejectedFaces& rejected = report.rejected_faces;
-    return py::dict("build_ms"_a = report.build_ms, "phases_ms"_a = phases_dict(report.phases_ms),
-                    "threads"_a = report.threads, "triangles"_a = report.triangles, "nodes"_a = report.nodes,
-                    "leaves"_a = report.leaves, "empty_leaves"_a = report.empty_leaves,
-                    "references"_a = report.references, "wide_nodes"_a = report.wide_nodes, "bytes"_a = report.bytes,
-                    "sah_cost"_a = report.sah_cost,
-                    "sah_constants"_a = py::dict("traversal"_a = sah.traversal, "block"_a = sah.block,
-                                                 "empty_bonus"_a = sah.empty_bonus, "max_depth"_a = sah.max_depth),
-                    "checksum"_a = hexadecimal(report.checksum),
-                    "rejected_faces"_a = py::dict("not_finite"_a = rejected.not_finite, "no_area"_a = rejected.no_area,
-                                                  "too_large"_a = rejected.too_large));
+    return py::dict(
+        "build_ms"_a = report.build_ms, "phases_ms"_a = phases_dict(report.phases_ms), "threads"_a = report.threads,
+        "triangles"_a = report.triangles, "nodes"_a = report.nodes, "leaves"_a = report.leaves,
+        "empty_leaves"_a = report.empty_leaves, "references"_a = report.references, "wide_nodes"_a = report.wide_nodes,
+        "bytes"_a = report.bytes, "sah_cost"_a = report.sah_cost,
+        "sah_constants"_a = py::dict("traversal"_a = sah.traversal, "block"_a = sah.block,
+                                     "empty_bonus"_a = sah.empty_bonus, "max_depth"_a = sah.max_depth),
+        "checksum"_a = hexadecimal(report.checksum), "rejected_faces"_a = rejected_dict(report.rejected_faces));
 }
 
 py::list objects_list(const Scene& scene) {
     py::list list;
     for (const ObjectSummary& object : scene.objects()) {
-        list.append(
-            py::dict("object"_a = object.object, "triangles"_a = object.triangles,
-                     "rejected_faces"_a = py::dict("not_finite"_a = object.not_finite, "no_area"_a = object.no_area,
-                                                   "too_large"_a = object.too_large)));
+        list.append(py::dict("object"_a = object.object, "triangles"_a = object.triangles,
+                             "rejected_faces"_a = rejected_dict(object.rejected)));
     }
     return list;
 }

@@ -184,25 +184,13 @@ void Scene::place(std::span<const MeshInput> meshes, std::span<const Placement> 
 void Scene::count_rejected(std::span<const Placement> placements, int threads) {
     const auto chunks =
         make_chunks(placements.size(), [&](size_t p) { return size_t{first_triangle_[p + 1]} - first_triangle_[p]; });
-    std::vector<ObjectSummary> counts(chunks.size());
+    std::vector<RejectedFaces> counts(chunks.size());
     parallel_for(threads, chunks.size(), [&](size_t c) {
-        ObjectSummary& count = counts[c];
+        RejectedFaces& rejected = counts[c];
         for (size_t i = chunks[c].begin; i < chunks[c].end; ++i) {
             const uint32_t* corners = &triangles_[3 * (first_triangle_[chunks[c].placement] + i)];
             const auto corner = [&](int k) { return to_float(vertex(corners[k])); };
-            switch (classify_face(corner(0), corner(1), corner(2))) {
-                case FaceFault::kNone:
-                    break;
-                case FaceFault::kNotFinite:
-                    ++count.not_finite;
-                    break;
-                case FaceFault::kNoArea:
-                    ++count.no_area;
-                    break;
-                case FaceFault::kTooLarge:
-                    ++count.too_large;
-                    break;
-            }
+            rejected.count(classify_face(corner(0), corner(1), corner(2)));
         }
     });
 
@@ -217,9 +205,7 @@ void Scene::count_rejected(std::span<const Placement> placements, int threads) {
     }
     for (size_t c = 0; c < chunks.size(); ++c) {
         ObjectSummary& object = objects_[object_of[chunks[c].placement]];
-        object.not_finite += counts[c].not_finite;
-        object.no_area += counts[c].no_area;
-        object.too_large += counts[c].too_large;
+        object.rejected += counts[c];
     }
 }
 

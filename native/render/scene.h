@@ -37,7 +37,7 @@ struct Placement {
 struct ObjectSummary {
     std::string object;
     uint64_t triangles = 0;
-    uint64_t not_finite = 0, no_area = 0, too_large = 0;
+    RejectedFaces rejected{};
 };
 
 /// A point on a triangle as seen by a ray, both normals of unit length and turned against the ray.

@@ -55,7 +55,7 @@ TEST(Render, ShadowRaysStartStrictlyOnTheirSideAndNear) {
         const std::vector<float> white{1.0F, 1.0F, 1.0F};
         const MeshInput mesh{"m", positions, triangle, NormalKind::kFlat, {}, {}};
         const Scene scene(std::span(&mesh, 1), std::vector<Placement>{{"o", 0, identity(), {0}}}, white, 1);
-        if (scene.objects()[0].no_area != 0) {
+        if (scene.objects()[0].rejected.no_area != 0) {
             continue;
         }
         const double u = random.uniform(0, 1), v = random.uniform(0, 1 - u);
