@@ -2,13 +2,14 @@
 # make preview [SCENE=file]   sets everything up, draws the scene, prints what building its tree cost per thread count
 # make test                   sets everything up, runs the C++ and the Python tests
 # make package                build/espalier-VERSION.zip, the extension as users install it
+# make bench [BENCH=--quick]  measures builds and rays beside Embree on the meshes it finds; BENCH=--help tells more
 # make sanitize               the C++ tests under the address, undefined-behaviour and thread sanitizers
 # make lint | make format     checks or applies the style of Python and C++
 # make blenders               the other Blenders the installation tests run in (root, 4 GB, kept in the user's cache)
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
-.PHONY: preview test test-native package sanitize lint format blenders native system python clean
+.PHONY: preview test test-native package bench sanitize lint format blenders native system python clean
 
 SCENE ?= build/scenes/interior.blend
 CACHE := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/espalier
@@ -16,6 +17,8 @@ JOBS := $(shell nproc)
 # What Blender's module loads, and what the native module is compiled with.
 SYSTEM := libgl1 libgomp1 libsm6 libxfixes3 libxi6 libxkbcommon0 libxrender1 libxxf86vm1 libhwy-dev \
 	$(if $(shell command -v c++),,g++)
+# Who is measured against, and what writes the figures down.
+PEERS := libembree-dev nlohmann-json3-dev
 NATIVE := CMakeLists.txt CMakePresets.json pyproject.toml $(shell find native -type f)
 ADDON := blender_manifest.toml $(wildcard addon/*.py)
 export PATH := $(CURDIR)/.venv/bin:$(PATH)
@@ -43,6 +46,12 @@ build/package.stamp: $(NATIVE) $(ADDON) tools/package.py | native
 	python tools/package.py
 	touch $@
 
+bench: native
+	@tools/need $(PEERS)
+	cmake --preset release -B build/bench -DESPALIER_TESTS=OFF -DESPALIER_BENCH=ON >/dev/null
+	cmake --build build/bench -j $(JOBS)
+	python -m bench.run $(BENCH)
+
 sanitize: sanitize-asan sanitize-tsan
 sanitize-%: python
 	@tools/need libgtest-dev
@@ -51,14 +60,14 @@ sanitize-%: python
 	ctest --preset $* --output-on-failure
 
 lint: python
-	@tools/need libgtest-dev
+	@tools/need libgtest-dev $(PEERS)
 	@tools/environment .venv "3.11 3.13" -r requirements/test.txt
 	@tools/environment .venv "3.11 3.13" -r requirements/lint.txt
 	ruff check .
 	ruff format --check .
-	mypy addon scenes tests tools
+	mypy addon bench scenes tests tools
 	git ls-files '*.h' '*.cpp' | xargs clang-format --dry-run -Werror
-	cmake --preset release -B build/lint -DESPALIER_MODULE=ON -Dpybind11_DIR="$$(python -m pybind11 --cmakedir)" >/dev/null
+	cmake --preset release -B build/lint -DESPALIER_MODULE=ON -DESPALIER_BENCH=ON -Dpybind11_DIR="$$(python -m pybind11 --cmakedir)" >/dev/null
 	git ls-files '*.cpp' | xargs -P $(JOBS) -n 1 clang-tidy --quiet -p build/lint
 
 format: python

@@ -1,0 +1,115 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+// What the measuring programs share: meshes, the modes that are measured, and contestants that take turns.
+#pragma once
+
+#include <algorithm>
+#include <array>
+#include <chrono>
+#include <fstream>
+#include <functional>
+#include <nlohmann/json.hpp>
+#include <numeric>
+#include <stdexcept>
+#include <string>
+#include <thread>
+#include <utility>
+#include <vector>
+
+#include "kdtree/parallel.h"
+#include "kdtree/tree.h"
+
+namespace espalier::bench {
+
+using Json = nlohmann::ordered_json;
+
+struct Mode {
+    const char* name;
+    Quality quality;
+};
+inline constexpr std::array kModes{Mode{"draft", Quality::kDraft}, Mode{"balanced", Quality::kBalanced},
+                                   Mode{"best", Quality::kBest}};
+
+/// How a mesh is looked at: a square pinhole picture and one point light.
+struct View {
+    Vec3f eye, target, up, light;
+    float slope;  ///< half the picture's width at distance 1
+};
+
+struct Mesh {
+    std::vector<float> positions;  ///< one more than belong to vertices: Embree reads 16 bytes of each
+    std::vector<uint32_t> triangles;
+    View view;
+
+    TriangleSoup soup() const { return {std::span(positions).first(positions.size() - 1), triangles}; }
+};
+
+/// Reads what run.py writes: two 64-bit counts, the view, positions and indices.
+inline Mesh read_mesh(const std::string& path) {
+    std::ifstream file(path, std::ios::binary);
+    const auto read = [&](void* to, size_t bytes) {
+        if (!file.read(static_cast<char*>(to), static_cast<std::streamsize>(bytes))) {
+            throw std::runtime_error(path + " cannot be read, or is shorter than its counts say");
+        }
+    };
+    Mesh mesh;
+    uint64_t counts[2];
+    read(counts, sizeof counts);
+    read(&mesh.view, sizeof mesh.view);
+    mesh.positions.resize(3 * counts[0] + 1);
+    mesh.triangles.resize(3 * counts[1]);
+    read(mesh.positions.data(), 3 * counts[0] * sizeof(float));
+    read(mesh.triangles.data(), 3 * counts[1] * sizeof(uint32_t));
+    return mesh;
+}
+
+/// The first triangles of a mesh: enough to load code and wake threads before a clock runs.
+inline Mesh sample_of(const Mesh& mesh) {
+    Mesh sample = mesh;
+    sample.triangles.resize(std::min<size_t>(mesh.triangles.size(), 3000));
+    return sample;
+}
+
+class Stopwatch {
+ public:
+    double ms() const {
+        return std::chrono::duration<double, std::milli>(std::chrono::steady_clock::now() - start_).count();
+    }
+
+ private:
+    std::chrono::steady_clock::time_point start_ = std::chrono::steady_clock::now();
+};
+
+/// Something that is timed again and again.
+struct Contestant {
+    Contestant(std::string n, int t, std::function<double()> r) : name(std::move(n)), threads(t), run(std::move(r)) {}
+
+    std::string name;
+    int threads;
+    std::function<double()> run;  ///< once; returns milliseconds
+    std::vector<double> ms;       ///< of each turn
+};
+
+/// Runs the contestants in turn, A B C A B C, until the time is spent, each at least three times. Those that are too
+/// slow to keep pace drop out earlier: after one turn, or when a quarter of the time was theirs.
+inline void take_turns(std::vector<Contestant>& contestants, double seconds) {
+    constexpr int kLeast = 3;
+    constexpr int kMost = 31;
+    const double available = seconds * 1e3;
+    const auto drops_out = [&](const Contestant& contestant) {
+        const double spent = std::accumulate(contestant.ms.begin(), contestant.ms.end(), 0.0);
+        return !contestant.ms.empty() &&
+               (contestant.ms[0] > available / 3 || (contestant.ms.size() >= kLeast && spent > available / 4));
+    };
+    const Stopwatch watch;
+    for (int turn = 0; turn < kMost && (turn < kLeast || watch.ms() < available); ++turn) {
+        for (Contestant& contestant : contestants) {
+            if (!drops_out(contestant)) {
+                // Threads of the one before go to sleep first; they spin for a while.
+                std::this_thread::sleep_for(std::chrono::milliseconds(2));
+                contestant.ms.push_back(contestant.run());
+            }
+        }
+    }
+}
+
+}  // namespace espalier::bench

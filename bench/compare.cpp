@@ -1,0 +1,67 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+// espalier_bench MESH SECONDS PART...: one mesh beside Embree, as JSON on standard output. MESH is a file that run.py
+// wrote; SECONDS go to each group of contestants; parts are memory, quality and builds. The instruction set of both
+// sides is what ESPALIER_SIMD says. Without arguments: the instruction sets that this machine runs.
+#include "compare.h"
+
+#include <malloc.h>
+#include <pmmintrin.h>
+#include <xmmintrin.h>
+
+#include <cstdio>
+#include <exception>
+#include <iostream>
+#include <set>
+
+namespace espalier::bench {
+namespace {
+
+Json compare(const std::string& path, double seconds, const std::set<std::string>& parts) {
+    // Large blocks come fresh from the system every time, as in a program's first build; by default glibc would begin
+    // to keep those that were freed.
+    mallopt(M_MMAP_THRESHOLD, 128 * 1024);
+    mallopt(M_TRIM_THRESHOLD, 128 * 1024);
+    // As Embree asks of its callers; our side sets and restores its own.
+    _MM_SET_FLUSH_ZERO_MODE(_MM_FLUSH_ZERO_ON);
+    _MM_SET_DENORMALS_ZERO_MODE(_MM_DENORMALS_ZERO_ON);
+
+    const Mesh mesh = read_mesh(path);
+    const int all = hardware_threads();
+    Json result{{"triangles", mesh.soup().size()},
+                {"threads", all},
+                {"simd", simd_target_names().front()},
+                {"compiler", "g++ " __VERSION__},
+                {"embree", RTC_VERSION_STRING}};
+    if (parts.contains("memory")) {
+        result["memory"] = compare_memory(mesh, all);
+    }
+    if (parts.contains("quality")) {
+        result["quality"] = compare_quality(mesh);
+    }
+    if (parts.contains("builds")) {
+        for (const int threads : std::set{1, all}) {
+            result["builds"].push_back(compare_builds(mesh, threads, seconds));
+        }
+    }
+    return result;
+}
+
+}  // namespace
+}  // namespace espalier::bench
+
+int main(int argc, char** argv) {
+    using namespace espalier;
+    try {
+        if (argc == 1) {
+            std::cout << bench::Json(simd_target_names()) << "\n";
+        } else if (argc > 3) {
+            std::cout << bench::compare(argv[1], std::stod(argv[2]), {argv + 3, argv + argc}) << "\n";
+        } else {
+            std::fputs("usage: espalier_bench [MESH SECONDS PART...]\n", stderr);
+            return 2;
+        }
+    } catch (const std::exception& error) {
+        std::fprintf(stderr, "espalier_bench: %s\n", error.what());
+        return 1;
+    }
+}

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The report of run.py as Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from statistics import median
+from typing import Any
+
+Times = Sequence[float]  # milliseconds of each turn
+
+ABOUT = (
+    "Contestants take turns in one process; times are medians (least to greatest), ratios are medians of the ratios "
+    "within a turn. Both sides get fresh memory while the clock runs, the same threads and the same instruction set. "
+    "Embree LOW and MEDIUM build a ROBUST scene, HIGH one that is not, since ROBUST turns its spatial splits off."
+)
+
+
+def table(head: str, rows: Iterable[Sequence[object]]) -> str:
+    """A Markdown table; `head` holds the column names, separated by bars"""
+    columns = head.count("|") + 1
+    lines = [f"| {head} |", "|---" * columns + "|"]
+    lines += ["| " + " | ".join(str(cell) for cell in row) + " |" for row in rows]
+    return "\n".join(lines)
+
+
+def spread(ms: Times) -> str:
+    """Median, least and greatest"""
+    return f"{median(ms):.2f} ({min(ms):.2f} to {max(ms):.2f})"
+
+
+def ratio(over: Times, under: Times) -> float:
+    """The median ratio of two contestants within a turn; one may have had fewer turns"""
+    return median(a / b for a, b in zip(over, under, strict=False))
+
+
+def per_simd(report: dict[str, Any], part: str) -> dict[str, list[tuple[str, dict[str, Any]]]]:
+    """By instruction set: the meshes with what was measured of them, where that part was"""
+    found: dict[str, list[tuple[str, dict[str, Any]]]] = {}
+    for mesh, of_mesh in report["meshes"].items():
+        for simd, measured in of_mesh.items():
+            if part in measured:
+                found.setdefault(simd, []).append((mesh, measured))
+    return found
+
+
+def build_rows(meshes: list[tuple[str, dict[str, Any]]]) -> Iterable[Sequence[object]]:
+    """One row per mesh, thread count and builder"""
+    for mesh, measured in meshes:
+        for group in measured["builds"]:
+            threads = group["threads"]
+            times = {(row["builder"], row["threads"]): row["ms"] for row in group["rows"]}
+            medium = times["Embree MEDIUM", threads]
+            for (builder, count), ms in times.items():
+                if count != threads:
+                    continue  # the serial builder beside the parallel one, for the efficiency alone
+                serial = times.get((builder, 1)) if threads > 1 else None
+                yield (
+                    mesh,
+                    threads,
+                    builder,
+                    spread(ms),
+                    len(ms),
+                    f"{measured['triangles'] / median(ms) / 1e3:.2f}",
+                    f"{ratio(medium, ms):.2f}",
+                    f"{ratio(serial, ms) / threads:.2f}" if serial else "",
+                )
+
+
+def phase_table(meshes: list[tuple[str, dict[str, Any]]]) -> str:
+    """Where the time of our builds goes"""
+    rows: list[Sequence[object]] = []
+    names: list[str] = []
+    for mesh, measured in meshes:
+        for group in measured["builds"]:
+            for row in group["rows"]:
+                if "phases_ms" in row and row["threads"] == group["threads"]:
+                    names = list(row["phases_ms"])
+                    phases = [f"{median(ms):.2f}" for ms in row["phases_ms"].values()]
+                    rows.append((mesh, group["threads"], row["builder"], *phases))
+    return table(" | ".join(["mesh", "threads", "mode", *names]), rows)
+
+
+def quality_rows(meshes: list[tuple[str, dict[str, Any]]]) -> Iterable[Sequence[object]]:
+    """One row per mesh and mode"""
+    for mesh, measured in meshes:
+        modes = measured["quality"]
+        for mode, found in modes.items():
+            excess = (
+                f"{100 * (found['sah_block'] / modes['exact']['sah_block'] - 1):+.1f} %" if "exact" in modes else ""
+            )
+            built = found["built_with"]
+            yield (
+                mesh,
+                mode,
+                f"{found['sah_block']:.1f}",
+                excess,
+                f"{found['sah_classic']:.1f}",
+                f"{built['traversal']:g}, {built['block']:g}",
+                found["nodes"],
+                found["wide_nodes"],
+                f"{found['references_per_triangle']:.2f}",
+                found["checksum"],
+            )
+
+
+def memory_rows(meshes: list[tuple[str, dict[str, Any]]]) -> Iterable[Sequence[object]]:
+    """One row per mesh and builder"""
+    for mesh, measured in meshes:
+        medium = next(row for row in measured["memory"] if row["builder"] == "Embree MEDIUM")
+        for row in measured["memory"]:
+            yield (
+                mesh,
+                row["builder"],
+                f"{row['peak_mb']:.1f}",
+                f"{row['kept_mb']:.1f}",
+                f"{row['kept_mb'] * 2**20 / measured['triangles']:.0f}",
+                f"{row['peak_mb'] / medium['peak_mb']:.2f}",
+                f"{row['kept_mb'] / medium['kept_mb']:.2f}",
+            )
+
+
+def header(report: dict[str, Any]) -> str:
+    """What was measured on, and with what"""
+    machine = report["machine"]
+    measured = next(iter(next(iter(report["meshes"].values())).values()))
+    busy = "" if machine["quiet"] else " **The machine was busy: do not quote these times.**"
+    return (
+        f"{machine['cpu']}, {machine['cores']} cores, {machine['memory_gib']} GiB, {machine['system']}; "
+        f"{measured['compiler']}, Embree {measured['embree']}; {machine['date']}, "
+        f"load at the start {machine['load']:.2f}.{busy}\n\n{ABOUT}"
+    )
+
+
+def markdown(report: dict[str, Any]) -> str:
+    """All tables of what the report holds"""
+    if not report["meshes"]:
+        return "No mesh was found.\n"
+    parts = ["# Espalier beside Embree", header(report)]
+    for simd, meshes in per_simd(report, "builds").items():
+        head = "mesh | threads | builder | ms | turns | Mtri/s | times as fast as MEDIUM | efficiency"
+        parts += [f"## Builds, {simd}", table(head, build_rows(meshes))]
+        parts += [f"### Phases, {simd}, median ms", phase_table(meshes)]
+    for meshes in per_simd(report, "quality").values():
+        head = (
+            "mesh | mode | SAH cost, step 15 and block 12 | over exact | SAH cost, step 15 and triangle 20 | "
+            "built with | nodes | wide nodes | references per triangle | checksum"
+        )
+        parts += ["## Quality", table(head, quality_rows(meshes))]
+    for meshes in per_simd(report, "memory").values():
+        head = "mesh | builder | peak MB | kept MB | kept bytes per triangle | peak, of MEDIUM's | kept, of MEDIUM's"
+        parts += ["## Memory over the input, all threads", table(head, memory_rows(meshes))]
+    return "\n\n".join(parts) + "\n"
