@@ -47,6 +47,9 @@ def main(argv: Sequence[str], *, needs_file: bool = False) -> int:
 
 def preview(arguments: argparse.Namespace) -> int:
     """Draw the scene, compare the builds, write what was asked for."""
+    if arguments.json is not None and arguments.json.resolve() == arguments.output.resolve():
+        _say("error: --output and --json name the same file")
+        return BAD_ARGUMENTS
     files = [path for path in (arguments.output, arguments.json) if path is not None]
     for path in files:  # better now than after the work
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -13,7 +13,7 @@ from typing import Any
 import bpy
 
 from . import report
-from .session import COMPARE, PREVIEW, last_report
+from .session import newest_report
 
 Color = tuple[float, float, float, float]
 
@@ -126,7 +126,7 @@ def _draw() -> None:
     from gpu_extras.batch import batch_for_shader
 
     context = bpy.context
-    last = last_report(context.scene, COMPARE) or last_report(context.scene, PREVIEW)
+    last = newest_report(context.scene)
     if last is None or not context.space_data.overlay.show_overlays:
         return
     system = context.preferences.system

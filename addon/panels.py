@@ -3,11 +3,15 @@
 
 from __future__ import annotations
 
+import textwrap
+
 import bpy
 
 from . import overlay, report
 from .operators import ESPALIER_OT_cancel, ESPALIER_OT_compare, ESPALIER_OT_overlay, ESPALIER_OT_preview, at_work
 from .session import COMPARE, PREVIEW, last_report
+
+WARNING_WIDTH = 38  # characters that fit beside an icon in a sidebar of Blender's own width
 
 
 class _Sidebar:
@@ -64,8 +68,11 @@ class _Results(_Sidebar):
         column = layout.column(align=True)
         for line in report.tree_lines(last):
             column.label(text=line)
-        for line in report.warnings(last):
-            layout.label(text=line, icon="ERROR")
+        for warning in report.warnings(last):
+            column = layout.column(align=True)
+            # A label does not wrap, and a sidebar is narrow.
+            for index, line in enumerate(textwrap.wrap(warning, WARNING_WIDTH)):
+                column.label(text=line, icon="BLANK1" if index else "ERROR")
 
     def draw_times(self, layout: bpy.types.UILayout, last: report.Report) -> None:
         raise NotImplementedError

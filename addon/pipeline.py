@@ -87,6 +87,7 @@ class Run:
         self._not_finite = arrays.not_finite
         scene = espalier_native.Scene(*arrays.to_native())
         self._objects = scene.objects
+        self._report["precision"] = scene.precision
         self._preview: Any = None
         self._compare: Any = None
         self._waiting: list[Callable[[], None]] = []
@@ -214,7 +215,7 @@ def _with_lost_faces(objects: list[dict[str, Any]], not_finite: dict[str, int]) 
     """The native side's account of each object, with the faces added that the export had to leave out."""
     entries = {entry["object"]: {**entry, "rejected_faces": dict(entry["rejected_faces"])} for entry in objects}
     for name, count in not_finite.items():
-        entry = entries.setdefault(name, {"object": name, "triangles": 0, "rejected_faces": {}})
+        entry = entries.setdefault(name, {"object": name, "triangles": 0, "rejected_faces": {}, "lost_precision": {}})
         rejected = entry["rejected_faces"]
         rejected["not_finite"] = rejected.get("not_finite", 0) + count
     return list(entries.values())

@@ -17,9 +17,16 @@ FAULTS = {
     "too_large": ("is too large", "are too large"),
 }
 
+# Where float's rounding took detail away, and what came of it.
+LOSSES = {
+    "mesh": "detail finer than {ulp} was lost before it came here, at {distance} from the object's origin",
+    "placement": "placed only to within {ulp}, at {distance} from the world's origin",
+    "scene": "detail finer than {ulp} is lost, at {distance} from the middle of the scene",
+}
+
 
 def warnings(report: Report) -> list[str]:
-    """One sentence for everything that is in the scene and not in the picture."""
+    """One sentence for everything that is in the scene and not, or not exactly, in the picture."""
     lines = []
     if not report["triangles"]:
         lines.append("Nothing to draw: the scene has no visible faces")
@@ -28,10 +35,46 @@ def warnings(report: Report) -> list[str]:
             if count:
                 one, many = FAULTS.get(fault, (f"was left out ({fault})", f"were left out ({fault})"))
                 lines.append(f"{entry['object']}: {count:,} {f'face {one}' if count == 1 else f'faces {many}'}")
+    lines.extend(lost_precision(report))
     lines.extend(f"{name}: {what} are not drawn" for name, what in report["left_out"].items())
     if len(checksums(report)) > 1:
         lines.append("The trees differ between thread counts: please report this")
     return lines
+
+
+def lost_precision(report: Report) -> list[str]:
+    """One sentence for each cause, with the object that lost most by it: a scene far away loses in all its objects."""
+    lines = []
+    for cause, what in LOSSES.items():
+        losers = [entry for entry in report["objects"] if cause in entry["lost_precision"]]
+        if losers:
+            worst = max(losers, key=lambda entry: float(entry["lost_precision"][cause]["ulp_per_median_edge"]))
+            lost = worst["lost_precision"][cause]
+            who = worst["object"] + (f" and {len(losers) - 1:,} more" if len(losers) > 1 else "")
+            lines.append(f"{who}: {what.format(ulp=length(lost['ulp_m']), distance=length(lost['distance_m']))}")
+    return lines
+
+
+def length(metres: float) -> str:
+    """A length in the unit in which it is easily read, with two digits."""
+    if metres >= 10.0:
+        return f"{metres:,.0f} m"
+    for factor, unit in ((1.0, "m"), (1e2, "cm"), (1e3, "mm")):
+        if metres * factor >= 1.0:
+            return f"{metres * factor:.2g} {unit}"
+    return f"{metres * 1e6:.2g} µm"
+
+
+def precision_line(report: Report) -> str:
+    """How fine the numbers are in which the scene is kept, against how fine the scene is."""
+    margin = report["precision"]
+    if not margin["median_edge_m"]:
+        return "Precision: no edges"
+    steps = margin["median_edge_m"] / margin["ulp_m"]
+    return (
+        f"Precision: steps of {length(margin['ulp_m'])} at {length(margin['distance_m'])} from the middle, "
+        f"{steps:,.0f} to a median edge of {length(margin['median_edge_m'])}"
+    )
 
 
 def checksums(report: Report) -> set[str]:
@@ -98,7 +141,7 @@ def table(report: Report) -> str:
     if trace := report.get("trace"):
         rays = trace["primary_rays"] + trace["shadow_rays"]
         lines.append(f"{rays:,} rays, {trace['samples']} per pixel, {trace['mrays_per_s']:.2f} Mrays/s")
-    lines += ["", *tree_lines(report)]
+    lines += ["", precision_line(report), *tree_lines(report)]
     if rows := _thread_rows(report):
         lines += ["", _ROW_HEAD]
         lines.extend(

@@ -14,13 +14,18 @@ from .settings import options_of
 PREVIEW = "preview"
 COMPARE = "compare"
 
-# The last report of each kind, by the scene's session_uid, which no other file's scene shares.
+# The last report of each kind, by the scene's session_uid, which no other file's scene shares; the newest at the end.
 _reports: dict[tuple[int, str], Report] = {}
 
 
 def last_report(scene: bpy.types.Scene, kind: str) -> Report | None:
     """What the last run of that kind said about this scene in this session of Blender."""
     return _reports.get((scene.session_uid, kind))
+
+
+def newest_report(scene: bpy.types.Scene) -> Report | None:
+    """What the last run of either kind said about this scene in this session of Blender."""
+    return next((report for (uid, _), report in reversed(_reports.items()) if uid == scene.session_uid), None)
 
 
 def forget() -> None:
@@ -76,6 +81,7 @@ class Session:
         except BaseException:
             self._restore()
             raise
+        _reports.pop(self._key, None)
         _reports[self._key] = result.report
         return result.report
 

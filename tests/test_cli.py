@@ -81,6 +81,7 @@ def test_other_files_are_imported_and_framed(stage: Stage, tmp_path: Path, suffi
         (["preview", "--output", "out.png", "--percentage", "-5"], "whole number"),
         (["preview", "nowhere.blend", "--output", "out.png"], "there is no file"),
         (["preview", "README.md", "--output", "out.png"], "neither a .blend"),
+        (["preview", "--output", "out.png", "--json", "folder/../out.png"], "the same file"),
         (["draw"], "invalid choice"),
     ],
 )

@@ -259,12 +259,14 @@ def test_faces_are_accounted_for_by_object() -> None:
             "object": "broken",
             "triangles": 2 * (len(triangles) + 4),
             "rejected_faces": {"not_finite": 4, "no_area": 2, "too_large": 2},
+            "lost_precision": {},
         },
-        {"object": "whole", "triangles": len(triangles), "rejected_faces": sound},
+        {"object": "whole", "triangles": len(triangles), "rejected_faces": sound, "lost_precision": {}},
         {
             "object": "needle",
             "triangles": len(triangles),
             "rejected_faces": sound | {"no_area": len(triangles)},
+            "lost_precision": {},
         },
     ]
     built = preview(what, 8).result()["build"]["rejected_faces"]

@@ -25,7 +25,8 @@ def a_report(**more: Any) -> dict[str, Any]:
     return {
         "scene": "Scene", "settings_used": "viewport", "quality": "balanced", "resolution": [64, 48], "triangles": 1000,
         "phases_ms": {"evaluation": 1.0, "export": 2.0, "top_levels": 40.0, "trace": 20.0}, "left_out": {},
-        "objects": [{"object": "Terrain", "triangles": 1000, "rejected_faces": {"not_finite": 0, "no_area": 12}}],
+        "objects": [{"object": "Terrain", "triangles": 1000, "rejected_faces": {"not_finite": 0, "no_area": 12},
+                     "lost_precision": {}}],
         "machine": {}, "build": a_row(2, 60.0), **more,
     }  # fmt: skip
 

@@ -217,7 +217,7 @@ def test_a_first_run_that_is_cancelled_leaves_no_picture(addon: ModuleType, cube
 
 def test_the_buttons_work_in_background_and_reuse_the_image(addon: ModuleType, cube: Stage) -> None:
     from addon import picture, pipeline
-    from addon.session import COMPARE, PREVIEW, last_report
+    from addon.session import COMPARE, PREVIEW, last_report, newest_report
 
     bpy = cube.bpy
     for percentage in (100, 50):
@@ -237,7 +237,17 @@ def test_the_buttons_work_in_background_and_reuse_the_image(addon: ModuleType, c
         bpy.ops.espalier.preview()
     np.testing.assert_array_equal(remembered(), good)
     assert last_report(cube.scene, PREVIEW) is not None
-    assert last_report(bpy.data.scenes.new("Other"), PREVIEW) is None
+    other = bpy.data.scenes.new("Other")
+    assert last_report(other, PREVIEW) is newest_report(other) is None
+
+
+def test_the_overlay_shows_the_run_that_was_last(addon: ModuleType, cube: Stage) -> None:
+    from addon.session import COMPARE, PREVIEW, last_report, newest_report
+
+    assert newest_report(cube.scene) is None
+    for operator, kind in (("preview", PREVIEW), ("compare", COMPARE), ("preview", PREVIEW)):
+        assert getattr(cube.bpy.ops.espalier, operator)() == {"FINISHED"}
+        assert newest_report(cube.scene) is last_report(cube.scene, kind)
 
 
 class Watcher:

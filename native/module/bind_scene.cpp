@@ -2,6 +2,7 @@
 #include <cmath>
 #include <limits>
 #include <memory>
+#include <span>
 #include <vector>
 
 #include "module/arrays.h"
@@ -84,6 +85,19 @@ std::shared_ptr<Scene> make_scene(const py::sequence& meshes, const py::sequence
     return std::make_shared<Scene>(inputs, placed, colors.span());
 }
 
+/// A copy with `width` values to the row.
+template <class T>
+py::array_t<T> rows_array(std::span<const T> values, size_t width) {
+    return py::array_t<T>({values.size() / width, width}, values.data());
+}
+
+py::dict scene_arrays(const Scene& scene) {
+    const std::span<const uint32_t> first = scene.first_triangles();
+    return py::dict("vertices"_a = rows_array(scene.soup().positions, 3),
+                    "triangles"_a = rows_array(scene.soup().triangles, 3),
+                    "first_triangles"_a = py::array_t<uint32_t>(first.size(), first.data()));
+}
+
 }  // namespace
 
 void bind_scene(py::module_& module) {
@@ -98,7 +112,10 @@ void bind_scene(py::module_& module) {
         .def(py::init(&make_scene), "meshes"_a, "placements"_a, "materials"_a, docs::kSceneInit)
         .def_property_readonly("triangle_count", &Scene::triangle_count, docs::kTriangleCount)
         .def_property_readonly("centre", centre, docs::kCentre)
-        .def_property_readonly("objects", &objects_list, docs::kObjects);
+        .def_property_readonly("objects", &objects_list, docs::kObjects)
+        .def_property_readonly(
+            "precision", [](const Scene& scene) { return precision_dict(scene.precision()); }, docs::kPrecision)
+        .def("arrays", &scene_arrays, docs::kSceneArrays);
 }
 
 }  // namespace espalier

@@ -78,7 +78,23 @@ inline constexpr const char* kCentre =
     "The middle of the world bounds, float64 [3]: the point that world triangles are relative to.";
 
 inline constexpr const char* kObjects =
-    "One dict per object name: object, triangles, rejected_faces {not_finite, no_area, too_large}.";
+    R"(One dict per object name: object, triangles, rejected_faces {not_finite, no_area, too_large}.
+
+lost_precision: empty where nothing was lost to float's rounding, else the precision (see `precision`)
+of a typical edge by cause. mesh: of the coordinates the mesh was given with. placement: of the
+matrix's translation, where that is a float. scene: of the world triangles. The first and the last are
+lost when an ulp is more than 1/64 of the median edge, a placement when it is more than 1/8 of it.)";
+
+inline constexpr const char* kPrecision =
+    R"(How fine float32 is at the rim of the scene, against how fine the scene is: a dict.
+
+distance_m: the largest coordinate of a world triangle, relative to the centre. ulp_m: how far apart
+neighbouring floats are there. median_edge_m, and ulp_per_median_edge: over an even sample of faces.)";
+
+inline constexpr const char* kSceneArrays = R"(Copies of the world triangles, relative to the centre.
+
+vertices: float32 [N, 3]. triangles: uint32 [M, 3]. first_triangles: uint32, the first triangle of each
+placement, then M.)";
 
 inline constexpr const char* kStartPreview =
     "Starts building a scene's tree and drawing its picture, and returns the Job at once.\n\n"

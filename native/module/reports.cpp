@@ -27,6 +27,17 @@ py::dict rejected_dict(const RejectedFaces& rejected) {
                     "too_large"_a = rejected.too_large);
 }
 
+py::dict lost_dict(const ObjectSummary& object) {
+    py::dict lost;
+    if (object.in_mesh.ulp_per_edge() > kLostShape)
+        lost["mesh"] = precision_dict(object.in_mesh);
+    if (object.in_placement.ulp_per_edge() > kLostPlace)
+        lost["placement"] = precision_dict(object.in_placement);
+    if (object.in_scene.ulp_per_edge() > kLostShape)
+        lost["scene"] = precision_dict(object.in_scene);
+    return lost;
+}
+
 py::dict row_dict(const CompareRow& row, const CompareRow& serial, int repeats) {
     const BuildReport& report = row.report;
     py::dict result = report_dict(report);
@@ -66,11 +77,17 @@ py::dict report_dict(const BuildReport& report) {
         "checksum"_a = hexadecimal(report.checksum), "rejected_faces"_a = rejected_dict(report.rejected_faces));
 }
 
+py::dict precision_dict(const Precision& precision) {
+    return py::dict("distance_m"_a = precision.distance, "ulp_m"_a = precision.ulp, "median_edge_m"_a = precision.edge,
+                    "ulp_per_median_edge"_a = precision.ulp_per_edge());
+}
+
 py::list objects_list(const Scene& scene) {
     py::list list;
     for (const ObjectSummary& object : scene.objects()) {
         list.append(py::dict("object"_a = object.object, "triangles"_a = object.triangles,
-                             "rejected_faces"_a = rejected_dict(object.rejected)));
+                             "rejected_faces"_a = rejected_dict(object.rejected),
+                             "lost_precision"_a = lost_dict(object)));
     }
     return list;
 }

@@ -11,6 +11,7 @@ namespace espalier {
 Quality quality_from(const std::string& name);
 
 pybind11::dict report_dict(const BuildReport& report);
+pybind11::dict precision_dict(const Precision& precision);
 pybind11::list objects_list(const Scene& scene);
 pybind11::dict preview_dict(const PreviewJob& job);
 pybind11::dict compare_dict(const CompareJob& job);

@@ -19,6 +19,10 @@ constexpr size_t kChunk = 16384;
 constexpr uint64_t kMaxTriangles = std::numeric_limits<int32_t>::max();
 constexpr uint64_t kMaxVertices = std::numeric_limits<uint32_t>::max();
 
+/// How many vertices or triangles make a median: of a mesh or the scene at most, of a placement at least.
+constexpr size_t kMostLookedAt = 4096;
+constexpr size_t kLeastLookedAt = 16;
+
 /// A run of consecutive vertices or triangles of one placement: the unit of parallel work.
 struct Chunk {
     size_t placement, begin, end;
@@ -37,6 +41,16 @@ std::vector<Chunk> make_chunks(size_t placements, const Count& count) {
 
 Vec3d load(std::span<const float> xyz, size_t index) {
     return {xyz[3 * index], xyz[3 * index + 1], xyz[3 * index + 2]};
+}
+
+double largest_component(Vec3d p) { return std::max({std::abs(p.x), std::abs(p.y), std::abs(p.z)}); }
+
+/// How much longer edges of all directions become, in the mean of the squares.
+double mean_scale(const Matrix4& matrix) {
+    double sum = 0.0;
+    for (int axis = 0; axis < 3; ++axis)
+        sum += dot(matrix.column(axis), matrix.column(axis));
+    return std::sqrt(sum / 3.0);
 }
 
 /// Whether a vertex may have a say in where the scene's centre is: one stray coordinate must not spoil all others.
@@ -119,7 +133,9 @@ Scene::Scene(std::span<const MeshInput> meshes, std::span<const Placement> place
                            {mesh.material_slots.begin(), mesh.material_slots.end()}});
     }
     place(meshes, placements, threads);
-    count_rejected(placements, threads);
+    const std::vector<size_t> object_of = name_objects(placements);
+    count_rejected(object_of, threads);
+    measure_precision(meshes, placements, object_of, threads);
     placing_ms_ = std::chrono::duration<double, std::milli>(std::chrono::steady_clock::now() - start).count();
 }
 
@@ -158,8 +174,10 @@ void Scene::place(std::span<const MeshInput> meshes, std::span<const Placement> 
     Bounds bounds;
     for (const Bounds& part : chunk_bounds)
         bounds.add(part);
-    if (bounds.lower.x <= bounds.upper.x)
+    if (bounds.lower.x <= bounds.upper.x) {
         centre_ = bounds.lower * 0.5 + bounds.upper * 0.5;
+        precision_.distance = 0.5 * largest_component(bounds.upper - bounds.lower);
+    }
 
     parallel_for(threads, vertex_chunks.size(), [&](size_t c) {
         const Chunk& chunk = vertex_chunks[c];
@@ -181,9 +199,23 @@ void Scene::place(std::span<const MeshInput> meshes, std::span<const Placement> 
     });
 }
 
-void Scene::count_rejected(std::span<const Placement> placements, int threads) {
+/// One summary per name; returns which of them each placement belongs to.
+std::vector<size_t> Scene::name_objects(std::span<const Placement> placements) {
+    std::unordered_map<std::string, size_t> by_name;
+    std::vector<size_t> object_of(placements.size());
+    for (size_t p = 0; p < placements.size(); ++p) {
+        const auto [entry, added] = by_name.try_emplace(placements[p].object, objects_.size());
+        if (added)
+            objects_.emplace_back().object = placements[p].object;
+        object_of[p] = entry->second;
+        objects_[entry->second].triangles += first_triangle_[p + 1] - first_triangle_[p];
+    }
+    return object_of;
+}
+
+void Scene::count_rejected(const std::vector<size_t>& object_of, int threads) {
     const auto chunks =
-        make_chunks(placements.size(), [&](size_t p) { return size_t{first_triangle_[p + 1]} - first_triangle_[p]; });
+        make_chunks(object_of.size(), [&](size_t p) { return size_t{first_triangle_[p + 1]} - first_triangle_[p]; });
     std::vector<RejectedFaces> counts(chunks.size());
     parallel_for(threads, chunks.size(), [&](size_t c) {
         RejectedFaces& rejected = counts[c];
@@ -193,19 +225,39 @@ void Scene::count_rejected(std::span<const Placement> placements, int threads) {
             rejected.count(classify_face(corner(0), corner(1), corner(2)));
         }
     });
+    for (size_t c = 0; c < chunks.size(); ++c)
+        objects_[object_of[chunks[c].placement]].rejected += counts[c];
+}
 
-    std::unordered_map<std::string, size_t> by_name;
-    std::vector<size_t> object_of(placements.size());
+void Scene::measure_precision(std::span<const MeshInput> meshes, std::span<const Placement> placements,
+                              const std::vector<size_t>& object_of, int threads) {
+    if (!triangles_.empty())
+        precision_ = precision_at(precision_.distance, typical_edge(positions_, triangles_, kMostLookedAt));
+    std::vector<Precision> in_mesh(meshes.size());
+    parallel_for(threads, meshes.size(), [&](size_t m) {
+        in_mesh[m] = precision_at(typical_distance(meshes[m].positions, kMostLookedAt),
+                                  typical_edge(meshes[m].positions, meshes[m].triangles, kMostLookedAt));
+    });
+    const size_t most = std::max(kLeastLookedAt, kMostLookedAt / std::max<size_t>(1, placements.size()));
+    std::vector<double> distances(placements.size());
+    parallel_for(threads, placements.size(), [&](size_t p) {
+        const std::span<const float> all = positions_;
+        distances[p] = typical_distance(
+            all.subspan(3 * size_t{placed_[p].first_vertex}, meshes[placements[p].mesh].positions.size()), most);
+    });
+
+    const auto keep_worse = [](Precision& worst, const Precision& other) {
+        if (other.ulp_per_edge() > worst.ulp_per_edge())
+            worst = other;
+    };
     for (size_t p = 0; p < placements.size(); ++p) {
-        const auto [entry, added] = by_name.try_emplace(placements[p].object, objects_.size());
-        if (added)
-            objects_.push_back({placements[p].object});
-        object_of[p] = entry->second;
-        objects_[entry->second].triangles += first_triangle_[p + 1] - first_triangle_[p];
-    }
-    for (size_t c = 0; c < chunks.size(); ++c) {
-        ObjectSummary& object = objects_[object_of[chunks[c].placement]];
-        object.rejected += counts[c];
+        ObjectSummary& object = objects_[object_of[p]];
+        const Precision own = in_mesh[placements[p].mesh] * mean_scale(placements[p].matrix);
+        keep_worse(object.in_mesh, own);
+        keep_worse(object.in_scene, precision_at(distances[p], own.edge));
+        const Vec3d at = placements[p].matrix.translation();
+        if (to_double(to_float(at)) == at)
+            keep_worse(object.in_placement, precision_at(largest_component(at), own.edge));
     }
 }
 

@@ -10,6 +10,7 @@
 #include "geometry/vec.h"
 #include "kdtree/tree.h"
 #include "render/matrix.h"
+#include "render/precision.h"
 
 namespace espalier {
 
@@ -33,11 +34,15 @@ struct Placement {
     std::vector<int32_t> materials;
 };
 
-/// What became of one object's faces, its placements taken together.
+/// What became of one object's faces, its placements taken together. Precisions are those of the placement that has
+/// least, in world units.
 struct ObjectSummary {
     std::string object;
     uint64_t triangles = 0;
     RejectedFaces rejected{};
+    Precision in_mesh;       // of the mesh's own coordinates, as they were given
+    Precision in_placement;  // of the matrix's translation, if that was a float once, as all of Blender's are
+    Precision in_scene;      // of the world triangles, relative to the scene's centre
 };
 
 /// A point on a triangle as seen by a ray, both normals of unit length and turned against the ray.
@@ -61,10 +66,14 @@ class Scene {
           int threads = 0);
 
     TriangleSoup soup() const { return {positions_, triangles_}; }
+    /// The first triangle of each placement, then the number of all.
+    std::span<const uint32_t> first_triangles() const { return first_triangle_; }
     uint64_t triangle_count() const { return triangles_.size() / 3; }
     Vec3d centre() const { return centre_; }
     double placing_ms() const { return placing_ms_; }
     const std::vector<ObjectSummary>& objects() const { return objects_; }
+    /// Of the scene's largest coordinate, relative to the centre, against its median edge.
+    const Precision& precision() const { return precision_; }
 
     /// The point (1-u-v) v0 + u v1 + v v2 of a triangle, hit by a ray along `direction`.
     SurfacePoint surface(uint32_t triangle, double u, double v, Vec3d direction) const;
@@ -84,7 +93,10 @@ class Scene {
     };
 
     void place(std::span<const MeshInput> meshes, std::span<const Placement> placements, int threads);
-    void count_rejected(std::span<const Placement> placements, int threads);
+    std::vector<size_t> name_objects(std::span<const Placement> placements);
+    void count_rejected(const std::vector<size_t>& object_of, int threads);
+    void measure_precision(std::span<const MeshInput> meshes, std::span<const Placement> placements,
+                           const std::vector<size_t>& object_of, int threads);
     size_t placement_of(uint32_t triangle) const;
     Vec3d vertex(uint32_t index) const;
 
@@ -97,6 +109,7 @@ class Scene {
     std::vector<Vec3f> materials_;
     std::vector<ObjectSummary> objects_;
     Vec3d centre_{0.0, 0.0, 0.0};
+    Precision precision_;
     double placing_ms_ = 0.0;
 };
 
