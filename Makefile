@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 # make preview [SCENE=file]   sets everything up, draws the scene, prints what building its tree cost per thread count
 # make test                   sets everything up, runs the C++ and the Python tests
+# make long-run [RAYS=1e8]    judges so many hard rays in exact arithmetic, and says what follows from finding no error
 # make package                build/espalier-VERSION.zip, the extension as users install it
 # make bench [BENCH=--quick]  measures builds and rays beside Embree on the meshes it finds; BENCH=--help tells more
 # make sanitize               the C++ tests under the address, undefined-behaviour and thread sanitizers
@@ -9,7 +10,7 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
-.PHONY: preview test test-native package bench sanitize lint format blenders native system python clean
+.PHONY: preview test test-native long-run package bench sanitize lint format blenders native system python clean
 
 SCENE ?= build/scenes/interior.blend
 CACHE := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/espalier
@@ -19,6 +20,8 @@ SYSTEM := libgl1 libgomp1 libsm6 libxfixes3 libxi6 libxkbcommon0 libxrender1 lib
 	$(if $(shell command -v c++),,g++)
 # Who is measured against, and what writes the figures down.
 PEERS := libembree-dev nlohmann-json3-dev
+# What the tests and the judge of hits are compiled with.
+TEST_SYSTEM := libgmp-dev libgtest-dev
 NATIVE := CMakeLists.txt CMakePresets.json pyproject.toml $(shell find native -type f)
 ADDON := blender_manifest.toml $(wildcard addon/*.py)
 export PATH := $(CURDIR)/.venv/bin:$(PATH)
@@ -36,10 +39,15 @@ test: test-native native package
 	python -m pytest
 
 test-native: python
-	@tools/need libgtest-dev
+	@tools/need $(TEST_SYSTEM)
 	cmake --preset release -DESPALIER_TESTS=ON
 	cmake --build --preset release -j $(JOBS)
 	ctest --preset release -j $(JOBS) --output-on-failure
+
+RAYS := 1e8
+long-run: test-native native
+	@tools/environment .venv "3.11 3.13" -r requirements/test.txt
+	python -m tests.exactness $(RAYS)
 
 package: build/package.stamp
 build/package.stamp: $(NATIVE) $(ADDON) tools/package.py | native
@@ -54,13 +62,13 @@ bench: native
 
 sanitize: sanitize-asan sanitize-tsan
 sanitize-%: python
-	@tools/need libgtest-dev
+	@tools/need $(TEST_SYSTEM)
 	cmake --preset $*
 	cmake --build --preset $* -j $(JOBS)
 	ctest --preset $* --output-on-failure
 
 lint: python
-	@tools/need libgtest-dev $(PEERS)
+	@tools/need $(TEST_SYSTEM) $(PEERS)
 	@tools/environment .venv "3.11 3.13" -r requirements/test.txt
 	@tools/environment .venv "3.11 3.13" -r requirements/lint.txt
 	ruff check .

@@ -2,7 +2,8 @@
 """The exact judge: which triangle a ray hits, and where, in rational arithmetic over the float32 inputs themselves.
 
 It shares nothing with the native code. The rules: triangles are closed; a ray in a triangle's plane misses it;
-t_min <= t <= t_max; the smallest exact t wins, of equal ones the lowest triangle index.
+t_min <= t <= t_max; the smallest exact t wins, of equal ones the lowest triangle index. Faces with a coordinate that is
+not finite or lies beyond 2^60 are set aside.
 """
 
 from __future__ import annotations
@@ -65,12 +66,13 @@ def hit_one(origin: Point, direction: Point, v0: Point, v1: Point, v2: Point) ->
 
 
 def candidates(origin: Floats, direction: Floats, corners: Doubles) -> NDArray[np.intp]:
-    """Every triangle that the line may meet: those whose three sides, in float64, are not surely of both signs.
+    """Every sound triangle that the line may meet: its three sides, in float64, are not surely of both signs.
 
     A side is a determinant of float32 differences; its error in float64 is below 16 * 2^-53 times the sum of the
     magnitudes of its terms, of which four times is allowed.
     """
-    p = corners - origin.astype(np.float64)
+    sound = np.flatnonzero((np.abs(corners) <= 2.0**60).all(axis=(1, 2)))
+    p = corners[sound] - origin.astype(np.float64)
     d = direction.astype(np.float64)
     positive = np.ones(len(p), bool)
     negative = np.ones(len(p), bool)
@@ -93,7 +95,7 @@ def candidates(origin: Floats, direction: Floats, corners: Doubles) -> NDArray[n
         size = np.abs(terms) @ np.abs(d[[0, 0, 1, 1, 2, 2]])
         positive &= side >= -size * 2.0**-47
         negative &= side <= size * 2.0**-47
-    return np.flatnonzero(positive | negative)
+    return np.asarray(sound[positive | negative])
 
 
 def judge(
