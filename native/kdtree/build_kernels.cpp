@@ -66,7 +66,7 @@ class SubtreeBuilder {
             right_begin = begin;
             right_room = room;
         }
-        const size_t right_child = output_.nodes.size();
+        const size_t right_child = output_.node_count();
         build(right, right_begin, right_room);
         output_.close_inner(index, split, right_child);
     }
@@ -83,11 +83,8 @@ class SubtreeBuilder {
     }
 
     void write_leaf(const OpenNode& node, const References& references) {
-        LeafWriter leaf(output_, node.count);
-        for (uint32_t i = 0; i < node.count; ++i) {
-            leaf.add(references.triangle[i]);
-        }
-        leaf.finish(node.tight);
+        std::copy_n(references.triangle, node.count, output_.add_leaf(node.count));
+        output_.last_box() = node.tight;
     }
 
     const SubtreeInput& input_;

@@ -2,10 +2,10 @@
 #pragma once
 
 #include <atomic>
-#include <vector>
 
 #include "kdtree/node.h"
 #include "kdtree/references.h"
+#include "kdtree/subtree_output.h"
 #include "kdtree/tree.h"
 
 namespace espalier {
@@ -37,37 +37,11 @@ struct BinCounts {
     alignas(64) uint32_t right[3][kMaxBins + 16];
 };
 
-struct Split {
-    int axis = -1;  ///< -1: the node is a leaf
-    float position = 0;
-};
-
 struct Partition {
     uint32_t left_count = 0;
     uint32_t right_count = 0;
     Box3f left_tight;
     Box3f right_tight;
-};
-
-/// The subtrees that one thread builds. Child and block indices count from the beginning of these arrays.
-struct SubtreeOutput {
-    std::vector<KdNode> nodes;
-    std::vector<Box3f> boxes;         ///< tight, per node
-    std::vector<uint32_t> triangles;  ///< kBlockSize per block, padded with kNoTriangle
-
-    /// Takes the place of an inner node, before its left child is written; returns its index.
-    size_t open_inner() {
-        nodes.push_back(KdNode::leaf(0, 0));
-        boxes.emplace_back();
-        return nodes.size() - 1;
-    }
-    /// Fills it in when both children are there.
-    void close_inner(size_t index, Split split, size_t right_child) {
-        nodes[index] = KdNode::inner(split.axis, split.position, static_cast<uint32_t>(right_child));
-        Box3f box = boxes[index + 1];
-        box.extend(boxes[right_child]);
-        boxes[index] = box;
-    }
 };
 
 /// What one thread needs while it builds a subtree.

@@ -141,12 +141,15 @@ class Builder {
                 top_->gather(*subtree.top, rooms_[w].references());
             }
             SubtreeOutput& output = outputs_[w];
+            if (output.nodes().data() == nullptr) {
+                output = SubtreeOutput(soup_.size() / static_cast<uint32_t>(threads_));
+            }
             subtree.worker = worker;
-            subtree.first_node = output.nodes.size();
-            subtree.first_triangle = output.triangles.size();
+            subtree.first_node = output.node_count();
+            subtree.first_triangle = output.triangle_count();
             build_kernels().build_subtree({&soup_, &parameters_, cancel_, &rooms_[w]}, *subtree.root, output);
-            subtree.node_count = output.nodes.size() - subtree.first_node;
-            subtree.triangle_count = output.triangles.size() - subtree.first_triangle;
+            subtree.node_count = output.node_count() - subtree.first_node;
+            subtree.triangle_count = output.triangle_count() - subtree.first_triangle;
         });
     }
 
@@ -199,14 +202,14 @@ class Builder {
         const auto node_shift = subtree.place - static_cast<uint32_t>(subtree.first_node);
         const auto block_shift = subtree.block_place - static_cast<uint32_t>(subtree.first_triangle / kBlockSize);
         for (size_t i = 0; i < subtree.node_count; ++i) {
-            const KdNode node = output.nodes[subtree.first_node + i];
+            const KdNode node = output.nodes()[subtree.first_node + i];
             tree_.nodes[subtree.place + i] =
                 node.is_leaf() ? KdNode::leaf(node.first_block() + block_shift, node.references())
                                : KdNode::inner(node.axis(), node.split(), node.right_child() + node_shift);
         }
-        std::copy_n(output.boxes.begin() + static_cast<std::ptrdiff_t>(subtree.first_node), subtree.node_count,
+        std::copy_n(output.boxes().begin() + static_cast<std::ptrdiff_t>(subtree.first_node), subtree.node_count,
                     boxes_.data() + subtree.place);
-        std::copy_n(output.triangles.begin() + static_cast<std::ptrdiff_t>(subtree.first_triangle),
+        std::copy_n(output.triangles().begin() + static_cast<std::ptrdiff_t>(subtree.first_triangle),
                     subtree.triangle_count, triangles_.data() + size_t{subtree.block_place} * kBlockSize);
     }
 

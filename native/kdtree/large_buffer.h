@@ -4,6 +4,7 @@
 #include <sys/mman.h>
 
 #include <cstddef>
+#include <cstdint>
 #include <new>
 #include <span>
 #include <type_traits>
@@ -11,8 +12,8 @@
 
 namespace espalier {
 
-/// Room for `capacity` items straight from the operating system, in huge pages where that pays. Memory is taken only
-/// when it is first written. Items start as zero bytes.
+/// Room for `capacity` items straight from the operating system. Memory is taken only when it is first written, in huge
+/// pages where they pay: a fault costs several times what clearing its 4 KiB does. Items start as zero bytes.
 template <class T>
 class LargeBuffer {
     static_assert(std::is_trivially_copyable_v<T>);
@@ -23,26 +24,36 @@ class LargeBuffer {
         if (capacity == 0) {
             return;
         }
+        if (capacity > SIZE_MAX / 2 / sizeof(T)) {
+            throw std::bad_alloc();
+        }
+        // A tail too short for a huge page of its own is left to small ones.
+        const size_t huge = (bytes() + kHugePage - kHugePagesFrom) / kHugePage * kHugePage;
+        mapped_ = bytes() + (huge != 0 ? kHugePage : 0);
         void* memory =
-            ::mmap(nullptr, bytes(), PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);
+            ::mmap(nullptr, mapped_, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);
         if (memory == MAP_FAILED) {
             throw std::bad_alloc();
         }
-        if (bytes() >= kHugePagesFrom) {
-            ::madvise(memory, bytes(), MADV_HUGEPAGE);
+        mapping_ = memory;
+        auto address = reinterpret_cast<uintptr_t>(memory);
+        if (huge != 0) {
+            address = (address + kHugePage - 1) / kHugePage * kHugePage;
+            ::madvise(reinterpret_cast<void*>(address), huge, MADV_HUGEPAGE);
         }
-        data_ = static_cast<T*>(memory);
+        data_ = reinterpret_cast<T*>(address);
     }
-    LargeBuffer(LargeBuffer&& other) noexcept
-        : data_(std::exchange(other.data_, nullptr)), capacity_(std::exchange(other.capacity_, 0)) {}
+    LargeBuffer(LargeBuffer&& other) noexcept { *this = std::move(other); }
     LargeBuffer& operator=(LargeBuffer&& other) noexcept {
         std::swap(data_, other.data_);
         std::swap(capacity_, other.capacity_);
+        std::swap(mapping_, other.mapping_);
+        std::swap(mapped_, other.mapped_);
         return *this;
     }
     ~LargeBuffer() {
-        if (data_ != nullptr) {
-            ::munmap(data_, bytes());
+        if (mapping_ != nullptr) {
+            ::munmap(mapping_, mapped_);
         }
     }
 
@@ -55,10 +66,12 @@ class LargeBuffer {
     std::span<const T> span() const { return {data_, capacity_}; }
 
  private:
-    static constexpr size_t kHugePagesFrom =
-        size_t{4} << 20;  ///< below, clearing the rest of the last page costs more than it saves
+    static constexpr size_t kHugePage = size_t{2} << 20;
+    static constexpr size_t kHugePagesFrom = size_t{384} << 10;  ///< clearing the rest of the page costs as much
     T* data_ = nullptr;
     size_t capacity_ = 0;
+    void* mapping_ = nullptr;
+    size_t mapped_ = 0;
 };
 
 }  // namespace espalier

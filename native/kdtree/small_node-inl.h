@@ -15,7 +15,6 @@
 
 #include <bit>
 #include <cstring>
-#include <stdexcept>
 
 #include "kdtree/binning-inl.h"
 #include "kdtree/build_kernels.h"
@@ -23,26 +22,6 @@
 HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
 namespace hn = hwy::HWY_NAMESPACE;
-
-/// Appends a leaf with these triangles.
-class LeafWriter {
- public:
-    explicit LeafWriter(SubtreeOutput& output, uint32_t references) : output_(output) {
-        if (output.triangles.size() / kBlockSize > kMaxBlocks) {
-            throw std::length_error("the tree needs more triangle blocks than its indices can count");
-        }
-        const auto first = static_cast<uint32_t>(output.triangles.size());
-        output.nodes.push_back(KdNode::leaf(first / kBlockSize, references));
-        output.triangles.resize(first + size_t{block_count(references)} * kBlockSize, kNoTriangle);
-        next_ = output.triangles.data() + first;
-    }
-    void add(uint32_t triangle) { *next_++ = triangle; }
-    void finish(const Box3f& box) { output_.boxes.push_back(box); }
-
- private:
-    SubtreeOutput& output_;
-    uint32_t* next_;
-};
 
 class SmallNode {
  public:
@@ -183,19 +162,17 @@ class SmallNode {
         OpenNode right;
         open_children(node, split_at, parts, left, right);
 
-        const size_t first_triangle = output_.triangles.size();
+        const size_t first_triangle = output_.triangle_count();
         const size_t index = output_.open_inner();
         const float left_cost = split(left_members, left);
-        const size_t right_child = output_.nodes.size();
+        const size_t right_child = output_.node_count();
         const float right_cost = split(right_members, right);
         const auto area = [&](const OpenNode& child) {
             return hn::GetLane(costs.relative_area(split_at.axis, hn::Set(df, child.cell.size()[split_at.axis])));
         };
         const float cost = traversal_cost_ + (area(left) * left_cost + area(right) * right_cost);
         if (leaf_cost <= cost) {  // the promise of the greedy choice was not kept: take the split back
-            output_.nodes.erase(output_.nodes.begin() + static_cast<std::ptrdiff_t>(index), output_.nodes.end());
-            output_.boxes.resize(index);
-            output_.triangles.resize(first_triangle);
+            output_.rewind(index, first_triangle);
             write_leaf(members, node);
             return leaf_cost;
         }
@@ -204,14 +181,14 @@ class SmallNode {
     }
 
     HWY_INLINE void write_leaf(uint64_t members, const OpenNode& node) {
-        LeafWriter leaf(output_, node.count);
+        uint32_t* next = output_.add_leaf(node.count);
         const hn::CappedTag<float, 8> d;
         constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<float, 8>());
         alignas(64) float box[8];
         std::fill(box, box + 8, std::numeric_limits<float>::infinity());
         for (uint64_t rest = members; rest != 0; rest &= rest - 1) {
             const auto i = static_cast<size_t>(std::countr_zero(rest));
-            leaf.add(references_.triangle[i]);
+            *next++ = references_.triangle[i];
             for (size_t k = 0; k < 8; k += kLanes) {
                 hn::Store(hn::Min(hn::Load(d, box + k), hn::Load(d, boxes_[i] + k)), d, box + k);
             }
@@ -221,7 +198,7 @@ class SmallNode {
             tight.lower[axis] = std::max(box[axis], node.cell.lower[axis] - reach_[axis]) + 0.0F;
             tight.upper[axis] = std::min(-box[axis + 4], node.cell.upper[axis] + reach_[axis]) + 0.0F;
         }
-        leaf.finish(node.count == 0 ? Box3f{} : tight);
+        output_.last_box() = node.count == 0 ? Box3f{} : tight;
     }
 
     const BuildParameters& parameters_;

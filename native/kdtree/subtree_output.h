@@ -1,0 +1,102 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+#pragma once
+
+#include <algorithm>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <span>
+#include <stdexcept>
+
+#include "geometry/vec.h"
+#include "kdtree/large_buffer.h"
+#include "kdtree/node.h"
+
+namespace espalier {
+
+struct Split {
+    int axis = -1;  ///< -1: the node is a leaf
+    float position = 0;
+};
+
+/// The subtrees that one thread builds: nodes depth first, the tight box of each, and the triangles of the leaves in
+/// whole blocks. Child and block indices count from the beginning of these arrays. All three lie in one piece of
+/// memory, so that small trees touch few pages.
+class SubtreeOutput {
+ public:
+    SubtreeOutput() = default;
+    /// With room for what so many references usually become.
+    explicit SubtreeOutput(size_t references) { reserve(references / 2 + 64, 3 * references + 1024); }
+
+    size_t node_count() const { return node_count_; }
+    size_t triangle_count() const { return triangle_count_; }
+    std::span<const KdNode> nodes() const { return {nodes_, node_count_}; }
+    std::span<const Box3f> boxes() const { return {boxes_, node_count_}; }
+    std::span<const uint32_t> triangles() const { return {triangles_, triangle_count_}; }
+
+    /// Takes the place of an inner node, before its left child is written; returns its index.
+    size_t open_inner() {
+        if (node_count_ == node_capacity_) {
+            reserve(2 * node_capacity_ + 64, triangle_capacity_);
+        }
+        return node_count_++;
+    }
+    /// Fills it in when both children are there.
+    void close_inner(size_t index, Split split, size_t right_child) {
+        nodes_[index] = KdNode::inner(split.axis, split.position, static_cast<uint32_t>(right_child));
+        Box3f box = boxes_[index + 1];
+        box.extend(boxes_[right_child]);
+        boxes_[index] = box;
+    }
+    /// Appends a leaf; returns the places of its triangles, whose last block is padded with kNoTriangle.
+    uint32_t* add_leaf(uint32_t references) {
+        const size_t index = open_inner();
+        const size_t first = triangle_count_;
+        const size_t room = size_t{block_count(references)} * kBlockSize;
+        if (first + room > triangle_capacity_) {
+            if (first / kBlockSize > kMaxBlocks) {
+                throw std::length_error("the tree needs more triangle blocks than its indices can count");
+            }
+            reserve(node_capacity_, 2 * (first + room));
+        }
+        nodes_[index] = KdNode::leaf(static_cast<uint32_t>(first / kBlockSize), references);
+        triangle_count_ += room;
+        std::fill(triangles_ + first + references, triangles_ + triangle_count_, kNoTriangle);
+        return triangles_ + first;
+    }
+    Box3f& last_box() { return boxes_[node_count_ - 1]; }
+    /// Takes back what was appended since the counts were these.
+    void rewind(size_t nodes, size_t triangles) {
+        node_count_ = nodes;
+        triangle_count_ = triangles;
+    }
+
+ private:
+    void reserve(size_t nodes, size_t triangles) {
+        const size_t bytes = nodes * (sizeof(KdNode) + sizeof(Box3f)) + triangles * sizeof(uint32_t);
+        LargeBuffer<std::byte> memory(bytes);
+        auto* new_nodes = reinterpret_cast<KdNode*>(memory.data());
+        auto* new_boxes = reinterpret_cast<Box3f*>(new_nodes + nodes);
+        auto* new_triangles = reinterpret_cast<uint32_t*>(new_boxes + nodes);
+        std::copy_n(nodes_, node_count_, new_nodes);
+        std::copy_n(boxes_, node_count_, new_boxes);
+        std::copy_n(triangles_, triangle_count_, new_triangles);
+        nodes_ = new_nodes;
+        boxes_ = new_boxes;
+        triangles_ = new_triangles;
+        node_capacity_ = nodes;
+        triangle_capacity_ = triangles;
+        memory_ = std::move(memory);
+    }
+
+    KdNode* nodes_ = nullptr;
+    Box3f* boxes_ = nullptr;
+    uint32_t* triangles_ = nullptr;
+    size_t node_count_ = 0;
+    size_t triangle_count_ = 0;
+    size_t node_capacity_ = 0;
+    size_t triangle_capacity_ = 0;
+    LargeBuffer<std::byte> memory_;
+};
+
+}  // namespace espalier
