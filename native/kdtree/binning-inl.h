@@ -11,6 +11,8 @@
 
 #include <hwy/highway.h>
 
+#include <cstring>
+
 #include "kdtree/build_kernels.h"
 #include "kdtree/sah-inl.h"
 
@@ -23,97 +25,154 @@ struct Slices {
     float origin;
     float scale;  ///< slices per unit, 0 if the interval is too thin to be cut
 
-    Slices(float lower, float upper, int slices) : origin(lower), scale(static_cast<float>(slices) / (upper - lower)) {
-        if (!(scale < 0x1p100F)) {
-            scale = 0;
-        }
-    }
+    Slices(float lower, float upper)
+        : origin(lower), scale(can_be_cut(lower, upper) ? static_cast<float>(kSlices) / (upper - lower) : 0.0F) {}
+    static bool can_be_cut(float lower, float upper) { return upper - lower > 0x1p-96F; }
 };
 
-/// Where planes `first` and following of `slices` cut [lower, upper]; the ends exactly.
+/// Where planes `first` and following of the slices cut [lower, upper]; the ends exactly.
 template <class D>
-HWY_INLINE hn::Vec<D> slice_positions(D d, float lower, float upper, int first, int slices) {
+HWY_INLINE hn::Vec<D> slice_positions(D d, float lower, float upper, int first) {
     const hn::RebindToSigned<D> di;
     const auto plane = hn::Iota(di, first);
-    const auto fraction = hn::Mul(hn::ConvertTo(d, plane), hn::Set(d, 1.0F / static_cast<float>(slices)));
+    const auto fraction = hn::Mul(hn::ConvertTo(d, plane), hn::Set(d, 1.0F / static_cast<float>(kSlices)));
     const auto between = hn::Add(hn::Set(d, lower), hn::Mul(hn::Set(d, upper - lower), fraction));
-    return hn::IfThenElse(hn::RebindMask(d, hn::Eq(plane, hn::Set(di, slices))), hn::Set(d, upper), between);
+    return hn::IfThenElse(hn::RebindMask(d, hn::Eq(plane, hn::Set(di, kSlices))), hn::Set(d, upper), between);
 }
 
 /// A count that no node reaches, small enough for signed comparison.
 constexpr uint64_t kMostReferences = 0x7ffffffe;
 
-/// References quantised to slices, a byte each: how many planes they begin and end behind.
-constexpr uint32_t kQuantisedChunk = 1024;
+/// References quantised to slices, a byte each.
+template <uint32_t kSize>
 struct Quantised {
-    alignas(64) uint8_t begin[kQuantisedChunk];
-    alignas(64) uint8_t end[kQuantisedChunk];
+    static_assert(kSize % 64 == 0);
+    alignas(64) int8_t begin[kSize];
+    alignas(64) int8_t end[kSize];
 };
 
+/// The bytes of two vectors of 16-bit numbers below 128, alternating.
+template <class V16, class D8>
+HWY_INLINE hn::Vec<D8> join_bytes(D8 d8, V16 even, V16 odd) {
+    return hn::BitCast(d8, hn::Or(even, hn::ShiftLeft<8>(odd)));
+}
+
+/// Puts the bytes that came from four vectors a, b, c, d through ReorderDemote2To and join_bytes in order again: each
+/// block of 16 holds a0 c0 a1 c1 a2 c2 a3 c3 b0 d0 ...
+template <class D8>
+HWY_INLINE hn::Vec<D8> in_order(D8 d8, hn::Vec<D8> bytes) {
+    const hn::Repartition<int32_t, D8> d32;
+    constexpr size_t kDwords = hn::MaxLanes(hn::Repartition<int32_t, D8>());
+    alignas(16) static constexpr int8_t kFromBlock[16] = {0, 2, 4, 6, 8, 10, 12, 14, 1, 3, 5, 7, 9, 11, 13, 15};
+    const auto grouped = hn::TableLookupBytes(bytes, hn::LoadDup128(d8, kFromBlock));
+    if constexpr (kDwords == 4) {
+        return grouped;
+    }
+    alignas(64) int32_t from[kDwords];
+    for (size_t i = 0; i < kDwords; ++i) {
+        from[i] = static_cast<int32_t>(4 * (i % (kDwords / 4)) + i / (kDwords / 4));
+    }
+    return hn::BitCast(d8, hn::TableLookupLanes(hn::BitCast(d32, grouped), hn::SetTableIndices(d32, from)));
+}
+
 /// begin: the last slice that starts at or before the lower bound. end: the last slice that starts before the upper
-/// bound, and not before `begin`, so that a reference that lies in a plane counts behind it. Both at most `last`.
-template <class D>
+/// bound, and not before `begin`, so that a reference that lies in a plane counts behind it. Both from 0 to `last`.
+/// Padded to vectors of 64 with `last`. References keep their order if asked to.
+template <bool kInOrder, class D, uint32_t kSize>
 HWY_INLINE void quantise(D df, const float* lower, const float* upper, Slices slices, int last, uint32_t count,
-                         Quantised& out) {
+                         Quantised<kSize>& out) {
     const hn::RebindToSigned<D> di;
-    const hn::Rebind<uint8_t, D> d8;
+    const hn::Repartition<int16_t, D> d16;
+    const hn::Repartition<int8_t, D> d8;
+    constexpr uint32_t kLanes = hn::MaxLanes(D());
     const auto origin = hn::Set(df, slices.origin);
     const auto scale = hn::Set(df, slices.scale);
-    const auto top = hn::Set(di, last);
-    const auto one = hn::Set(di, 1);
-    for (uint32_t i = 0; i < count; i += static_cast<uint32_t>(hn::Lanes(df))) {
-        const auto low = hn::Mul(hn::Sub(hn::LoadU(df, lower + i), origin), scale);
-        const auto high = hn::Mul(hn::Sub(hn::LoadU(df, upper + i), origin), scale);
-        const auto begin = hn::Min(hn::ConvertTo(di, low), top);
-        const auto end = hn::Min(hn::Sub(hn::ConvertTo(di, hn::Ceil(high)), one), top);
-        hn::StoreU(hn::DemoteTo(d8, begin), d8, out.begin + i);
-        hn::StoreU(hn::DemoteTo(d8, hn::Max(begin, end)), d8, out.end + i);
+    const auto zero = hn::Zero(d16);
+    const auto top = hn::Set(d16, static_cast<int16_t>(last));
+    const auto step = [&](uint32_t i, auto load) {
+        const auto begins = [&](uint32_t k) { return hn::ConvertTo(di, load(lower, i + k * kLanes)); };
+        const auto ends = [&](uint32_t k) { return hn::ConvertTo(di, hn::Ceil(load(upper, i + k * kLanes))); };
+        // What lies outside the interval saturates.
+        const auto begin = [&](uint32_t k) {
+            return hn::Max(zero, hn::Min(hn::ReorderDemote2To(d16, begins(k), begins(k + 1)), top));
+        };
+        const auto end = [&](uint32_t k, auto least) {
+            const auto behind = hn::Max(zero, hn::ReorderDemote2To(d16, ends(k), ends(k + 1)));
+            return hn::Max(least, hn::Min(hn::Sub(behind, hn::Set(d16, 1)), top));
+        };
+        const auto begin0 = begin(0);
+        const auto begin1 = begin(2);
+        auto begin_bytes = join_bytes(d8, begin0, begin1);
+        auto end_bytes = join_bytes(d8, end(0, begin0), end(2, begin1));
+        if constexpr (kInOrder) {
+            begin_bytes = in_order(d8, begin_bytes);
+            end_bytes = in_order(d8, end_bytes);
+        }
+        hn::Store(begin_bytes, d8, out.begin + i);
+        hn::Store(end_bytes, d8, out.end + i);
+    };
+    const auto in_slices = [&](const float* values, uint32_t i) {
+        return hn::Mul(hn::Sub(hn::LoadU(df, values + i), origin), scale);
+    };
+    uint32_t i = 0;
+    for (; i + 4 * kLanes <= count; i += 4 * kLanes) {
+        step(i, in_slices);
+    }
+    for (; i < (count + 63) / 64 * 64; i += 4 * kLanes) {
+        step(i, [&](const float* values, uint32_t at) {
+            const auto exists = hn::FirstN(df, at < count ? count - at : 0);
+            return hn::IfThenElse(exists, in_slices(values, at), hn::Set(df, 1.0F + static_cast<float>(kSlices)));
+        });
     }
 }
 
-/// Bytes of [values, values + count) below `bound`; count is a multiple of 64.
+template <class D>
+HWY_INLINE uint64_t mask_bits(D d, hn::Mask<D> mask) {
+    uint8_t bytes[8] = {};
+    hn::StoreMaskBits(d, mask, bytes);
+    uint64_t bits = 0;
+    std::memcpy(&bits, bytes, sizeof bits);
+    return bits;
+}
+
+/// Bytes of [values, values + count) below first_bound, first_bound + 1, ...; count is a multiple of 64.
 template <int kPlanes>
-HWY_INLINE void count_below(const uint8_t* values, uint32_t count, int first_bound, uint32_t* totals) {
+HWY_INLINE void count_below(const int8_t* values, uint32_t count, int first_bound, uint32_t* totals) {
     const hn::ScalableTag<int8_t> d;
     uint32_t below[kPlanes] = {};
     for (uint32_t i = 0; i < count; i += static_cast<uint32_t>(hn::Lanes(d))) {
-        const auto v = hn::Load(d, reinterpret_cast<const int8_t*>(values) + i);
+        const auto v = hn::Load(d, values + i);
         for (int k = 0; k < kPlanes; ++k) {
             below[k] +=
                 static_cast<uint32_t>(hn::CountTrue(d, hn::Lt(v, hn::Set(d, static_cast<int8_t>(first_bound + k)))));
         }
     }
     for (int k = 0; k < kPlanes; ++k) {
-        totals[k] += below[k];
+        totals[first_bound + k] += below[k];
     }
 }
 
-inline void count_bins(const References& references, uint32_t count, const Box3f& tight, int bins, BinCounts& counts) {
+inline void count_bins(const References& references, uint32_t count, const Box3f& range, BinCounts& counts) {
     const hn::ScalableTag<float> df;
-    constexpr int kGroup = 5;  // planes whose counters stay in registers
-    constexpr uint8_t kNever = 127;
+    constexpr uint32_t kChunk = 1024;
+    constexpr int kGroup = (kSlices - 1) / 2;  // planes whose counters stay in registers
+    static_assert(kSlices % 2 == 1);
     for (int axis = 0; axis < 3; ++axis) {
-        const Slices slices(tight.lower[axis], tight.upper[axis], bins);
+        const Slices slices(range.lower[axis], range.upper[axis]);
         if (slices.scale == 0) {
             continue;
         }
         const auto a = static_cast<size_t>(axis);
-        for (uint32_t begin = 0; begin < count; begin += kQuantisedChunk) {
-            const uint32_t size = std::min(kQuantisedChunk, count - begin);
+        uint32_t* left = counts.left[axis];
+        uint32_t* ends_before = counts.ends_before[axis];
+        for (uint32_t begin = 0; begin < count; begin += kChunk) {
+            const uint32_t size = std::min(kChunk, count - begin);
             const uint32_t padded = (size + 63) / 64 * 64;
-            Quantised q;
-            quantise(df, references.lower[a] + begin, references.upper[a] + begin, slices, bins - 1, size, q);
-            std::fill(q.begin + size, q.begin + padded, kNever);
-            std::fill(q.end + size, q.end + padded, kNever);
-            uint32_t ends_before[kMaxBins + kGroup] = {};
-            uint32_t begins_before[kMaxBins + kGroup] = {};
-            for (int j = 1; j < bins; j += kGroup) {
-                count_below<kGroup>(q.begin, padded, j, begins_before + j);
-                count_below<kGroup>(q.end, padded, j, ends_before + j);
-            }
-            for (int j = 1; j < bins; ++j) {
-                counts.left[axis][j] += begins_before[j];
-                counts.right[axis][j] += size - ends_before[j];
+            Quantised<kChunk> q;
+            quantise<false>(df, references.lower[a] + begin, references.upper[a] + begin, slices, kSlices - 1, size, q);
+            for (int j = 1; j < kSlices; j += kGroup) {
+                count_below<kGroup>(q.begin, padded, j, left);
+                count_below<kGroup>(q.end, padded, j, ends_before);
             }
         }
     }
@@ -130,46 +189,50 @@ HWY_INLINE hn::Vec<D> expected_blocks(D d, hn::Vec<DU> counts) {
     return hn::IfThenElse(hn::RebindMask(d, is_small), exact, fraction);
 }
 
+/// The costs of the planes from `first` on that cut [lower, upper] into slices.
+template <class D>
+HWY_INLINE hn::Vec<D> slice_costs(D d, const SplitCosts<D>& costs, const OpenNode& node, int axis, float lower,
+                                  float upper, const BinCounts& counts, int first) {
+    const hn::RebindToUnsigned<D> du;
+    const hn::RebindToSigned<D> di;
+    const auto left = hn::Load(du, counts.left[axis] + first);
+    const auto right = hn::Sub(hn::Set(du, node.count), hn::Load(du, counts.ends_before[axis] + first));
+    const auto too_many =
+        hn::Set(di, static_cast<int32_t>(std::min<uint64_t>(node.count + node.spare, kMostReferences) + 1));
+    const auto is_affordable = hn::RebindMask(d, hn::Lt(hn::BitCast(di, hn::Add(left, right)), too_many));
+    const auto position = slice_positions(d, lower, upper, first);
+    const auto cost = costs(axis, position, expected_blocks(d, left), expected_blocks(d, right));
+    return hn::IfThenElse(is_affordable, cost, hn::Inf(d));
+}
+
 inline Split choose_split(const OpenNode& node, BinCounts& counts, const BuildParameters& parameters) {
-    const hn::ScalableTag<float> d;
-    const hn::RebindToUnsigned<decltype(d)> du;
-    const hn::RebindToSigned<decltype(d)> di;
+    const hn::CappedTag<float, 16> d;
     const CellShape shape(node.cell);
     if (node.depth >= parameters.sah.max_depth || !shape.is_splittable()) {
         return {};
     }
-    const int bins = parameters.bins;
     const SplitCosts costs(d, node, shape, parameters.sah);
-    const auto too_many =
-        hn::Set(di, static_cast<int32_t>(std::min<uint64_t>(node.count + node.spare, kMostReferences) + 1));
     CheapestPlane cheapest(d);
     for (int axis = 0; axis < 3; ++axis) {
         const float lower = node.tight.lower[axis];
         const float upper = node.tight.upper[axis];
-        if (Slices(lower, upper, bins).scale == 0) {
+        if (!Slices::can_be_cut(lower, upper)) {
             continue;
         }
-        counts.left[axis][0] = counts.right[axis][bins] = 0;
-        counts.left[axis][bins] = counts.right[axis][0] = node.count;
-        const auto last = hn::Set(di, bins);
-        for (int j = 0; j <= bins; j += static_cast<int>(hn::Lanes(d))) {
-            const auto position = slice_positions(d, lower, upper, j, bins);
-            const auto left = hn::Load(du, counts.left[axis] + j);
-            const auto right = hn::Load(du, counts.right[axis] + j);
-            const auto cost = costs(axis, position, expected_blocks(d, left), expected_blocks(d, right));
-            const auto counts_as =
-                hn::AndNot(hn::Gt(hn::Iota(di, j), last), hn::Lt(hn::BitCast(di, hn::Add(left, right)), too_many));
-            cheapest.offer(axis * (bins + 1) + j, hn::IfThenElse(hn::RebindMask(d, counts_as), cost, hn::Inf(d)));
+        counts.left[axis][kSlices] = counts.ends_before[axis][kSlices] = node.count;
+        for (int j = 0; j <= kSlices; j += static_cast<int>(hn::Lanes(d))) {
+            cheapest.offer(axis * kPlanes + j, slice_costs(d, costs, node, axis, lower, upper, counts, j));
         }
     }
+    const hn::RebindToUnsigned<decltype(d)> du;
     const auto leaf_cost =
         static_cast<float>(parameters.sah.block) * hn::GetLane(expected_blocks(d, hn::Set(du, node.count)));
     if (!(cheapest.cost() < leaf_cost)) {
         return {};
     }
-    const int axis = cheapest.index() / (bins + 1);
-    const auto position =
-        slice_positions(d, node.tight.lower[axis], node.tight.upper[axis], cheapest.index() % (bins + 1), bins);
+    const int axis = cheapest.index() / kPlanes;
+    const int plane = cheapest.index() % kPlanes;
+    const auto position = slice_positions(d, node.tight.lower[axis], node.tight.upper[axis], plane);
     return {axis, hn::GetLane(position)};
 }
 

@@ -29,14 +29,14 @@ class SubtreeBuilder {
     void build(const OpenNode& node, size_t begin, size_t room) {
         const References references = at(begin);
         if (node.count <= kSmallNode) {
-            const SmallNode finish(references, node, *input_.parameters, output_);
+            const SmallNode<kSmallNode / 32> finish(references, node, *input_.parameters, output_);
             return;
         }
         if (input_.cancel != nullptr && input_.cancel->load(std::memory_order_relaxed)) {
             throw BuildCancelled();
         }
         BinCounts counts{};
-        count_bins(references, node.count, node.tight, input_.parameters->bins, counts);
+        count_bins(references, node.count, node.tight, counts);
         const Split split = choose_split(node, counts, *input_.parameters);
         if (split.axis < 0) {
             write_leaf(node, references);

@@ -13,13 +13,16 @@ namespace espalier {
 /// What the quality modes differ in.
 struct BuildParameters {
     SahConstants sah;
-    int bins;   ///< per axis, in nodes of more than kSmallNode references
     bool clip;  ///< whether straddlers' boxes are cut to the part of the triangle on each side
 };
 
 /// A node of at most this many references is finished as one bit mask per plane and side.
 constexpr uint32_t kSmallNode = 64;
-constexpr int kMaxBins = 32;
+
+/// Along each axis the planes between so many slices of a node's tight box are tried, and both its ends: as many planes
+/// as the widest vector has lanes.
+constexpr int kSlices = 15;
+constexpr int kPlanes = kSlices + 1;
 
 /// A node that is yet to be split.
 struct OpenNode {
@@ -30,11 +33,11 @@ struct OpenNode {
     int depth;
 };
 
-/// References that begin before plane j, and that end behind it, per axis, for the planes between bins. Counts add up
-/// over parts of a node. There is room for both ends of the node's tight box, and for vector code to read on.
+/// References that begin before plane j, and that end before it, per axis, for the planes between slices. Counts add up
+/// over parts of a node. There is room for both ends of the node's tight box.
 struct BinCounts {
-    alignas(64) uint32_t left[3][kMaxBins + 16];
-    alignas(64) uint32_t right[3][kMaxBins + 16];
+    alignas(64) uint32_t left[3][kPlanes];
+    alignas(64) uint32_t ends_before[3][kPlanes];
 };
 
 struct Partition {
@@ -63,7 +66,7 @@ struct BuildKernels {
     uint32_t (*make_references)(const TriangleSoup& soup, uint32_t begin, uint32_t end, const References& out,
                                 Box3f& bounds, RejectedFaces& rejected);
     /// Adds part of a node's references to its counts.
-    void (*count_bins)(const References& references, uint32_t count, const Box3f& tight, int bins, BinCounts& counts);
+    void (*count_bins)(const References& references, uint32_t count, const Box3f& tight, BinCounts& counts);
     /// The plane of least cost by the surface area heuristic, or a leaf. Fills in the counts at the ends of the tight
     /// box.
     Split (*choose_split)(const OpenNode& node, BinCounts& counts, const BuildParameters& parameters);

@@ -31,7 +31,7 @@ class Stopwatch {
 };
 
 BuildParameters parameters_of(Quality quality) {
-    BuildParameters parameters{{}, 16, true};
+    BuildParameters parameters{{}, true};
     switch (quality) {
         case Quality::kDraft:
             parameters.clip = false;
@@ -40,7 +40,6 @@ BuildParameters parameters_of(Quality quality) {
         case Quality::kBalanced:
             break;
         case Quality::kBest:
-            parameters.bins = 32;
             break;
     }
     return parameters;

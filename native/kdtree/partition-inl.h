@@ -12,8 +12,8 @@
 #include <hwy/highway.h>
 
 #include <bit>
-#include <cstring>
 
+#include "kdtree/binning-inl.h"
 #include "kdtree/build_kernels.h"
 
 HWY_BEFORE_NAMESPACE();
@@ -34,8 +34,8 @@ class BoxUnion {
         }
     }
     HWY_INLINE void extend(int axis, M which, V lower, V upper) {
-        lower_[axis] = hn::Min(lower_[axis], hn::IfThenElse(which, lower, hn::Inf(d_)));
-        upper_[axis] = hn::Max(upper_[axis], hn::IfThenElse(which, upper, hn::Neg(hn::Inf(d_))));
+        lower_[axis] = hn::IfThenElse(which, hn::Min(lower_[axis], lower), lower_[axis]);
+        upper_[axis] = hn::IfThenElse(which, hn::Max(upper_[axis], upper), upper_[axis]);
     }
     HWY_INLINE Box3f box() const {
         Box3f box;
@@ -223,17 +223,12 @@ inline uint32_t remove_references(const References& references, uint32_t count,
     return count - static_cast<uint32_t>(positions.size());
 }
 
-template <class D>
-HWY_INLINE uint64_t mask_bits(D d, hn::Mask<D> mask) {
-    uint8_t bytes[8] = {};
-    hn::StoreMaskBits(d, mask, bytes);
-    uint64_t bits = 0;
-    std::memcpy(&bits, bytes, sizeof bits);
-    return bits;
-}
-
-inline Partition partition(const TriangleSoup& soup, const References& in, uint32_t count, Split split, bool clip,
-                           const References& left, const References& right) {
+inline Partition partition(const TriangleSoup& soup, const References& from, uint32_t count, Split split, bool clip,
+                           const References& to_left_side, const References& to_right_side) {
+    // Copies, so that the compiler knows that no store changes the pointers.
+    const References in = from;
+    const References left = to_left_side;
+    const References right = to_right_side;
     const hn::ScalableTag<float> d;
     const hn::RebindToUnsigned<decltype(d)> du;
     const auto lanes = static_cast<uint32_t>(hn::Lanes(d));

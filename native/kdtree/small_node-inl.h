@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// The last references of a subtree, as one 64-bit mask: each candidate plane has a mask of the references to its left
+// The last references of a subtree, as one bit mask: each candidate plane has a mask of the references to its left
 // and one of those to its right, so that counts are population counts and children are intersections, and no reference
 // is moved again. After the small nodes of Zhou, Hou, Wang and Guo 2008, section 3.3. Compiled once per instruction set
 // (see build_kernels.cpp).
@@ -23,123 +23,170 @@ HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
 namespace hn = hwy::HWY_NAMESPACE;
 
+/// A set of references as a bit mask, in words that hold as many bits as a lane that counts references.
+template <size_t kWords>
+struct Members {
+    uint32_t word[kWords];
+
+    uint32_t count() const {
+        uint32_t sum = 0;
+        for (const uint32_t bits : word) {
+            sum += static_cast<uint32_t>(std::popcount(bits));
+        }
+        return sum;
+    }
+};
+
+/// Finishes a node of at most 32 * kWords references.
+template <size_t kWords>
 class SmallNode {
  public:
+    static constexpr uint32_t kCapacity = 32 * kWords;
+
     HWY_INLINE SmallNode(const References& references, const OpenNode& node, const BuildParameters& parameters,
                          SubtreeOutput& output)
         : parameters_(parameters),
           traversal_cost_(static_cast<float>(parameters.sah.traversal)),
           block_cost_(static_cast<float>(parameters.sah.block)),
-          references_(references),
+          triangles_(references.triangle),
           output_(output) {
         for (int axis = 0; axis < 3; ++axis) {
-            place_planes(axis, node.count, node.tight.lower[axis], node.tight.upper[axis]);
+            const auto a = static_cast<size_t>(axis);
+            place_planes(axis, node.count, references.lower[a], references.upper[a], node.tight);
         }
-        for (uint32_t i = 0; i < node.count; ++i) {
-            float* box = boxes_[i];
-            for (size_t axis = 0; axis < 3; ++axis) {
-                box[axis] = references.lower[axis][i];
-                box[axis + 4] = -references.upper[axis][i];
-            }
-            box[3] = box[7] = 0;
+        store_boxes(references, node.count);
+        Members<kWords> all;
+        for (uint32_t w = 0; w < kWords; ++w) {
+            const uint32_t left = node.count > 32 * w ? node.count - 32 * w : 0;
+            all.word[w] = left >= 32 ? ~0U : (1U << left) - 1;
         }
-        const uint64_t all = node.count == 64 ? ~uint64_t{0} : (uint64_t{1} << node.count) - 1;
         split(all, node);
     }
 
  private:
-    static constexpr int kSlices = 31;
-    static constexpr int kPlanes = 32;  ///< per axis, both ends of the tight box among them
+    /// Per axis, word and plane: the references that begin before the plane, and those that end behind it.
+    using PlaneMasks = uint32_t[3][kWords][kPlanes];
 
     /// The planes of one axis and the masks of what begins before and ends behind each.
-    HWY_INLINE void place_planes(int axis, uint32_t count, float lower, float upper) {
+    HWY_INLINE void place_planes(int axis, uint32_t count, const float* lowers, const float* uppers,
+                                 const Box3f& tight) {
         const hn::CappedTag<float, 16> df;
         const hn::CappedTag<int8_t, 64> d8;
-        const Slices slices(lower, upper, kSlices);
-        float* positions = positions_ + axis * kPlanes;
-        uint64_t* left = left_ + axis * kPlanes;
-        uint64_t* right = right_ + axis * kPlanes;
+        const float lower = tight.lower[axis];
+        const float upper = tight.upper[axis];
+        const Slices slices(lower, upper);
+        float* positions = positions_[axis];
+        auto& left = left_[axis];
+        auto& right = right_[axis];
         // How far a reference that is counted on one side of a plane may reach beyond it: rounding of (x - lower) *
         // scale against that of the plane's position.
         reach_[axis] = (upper - lower) * 0x1p-20F + std::max(std::abs(lower), std::abs(upper)) * 0x1p-22F + 0x1p-120F;
         if (slices.scale == 0) {
             std::fill(positions, positions + kPlanes, std::numeric_limits<float>::infinity());  // never inside the cell
-            std::fill(left, left + kPlanes, 0);
-            std::fill(right, right + kPlanes, 0);
+            std::memset(left, 0, sizeof left);
+            std::memset(right, 0, sizeof right);
             return;
         }
-        Quantised q;
-        const auto a = static_cast<size_t>(axis);
-        quantise(df, references_.lower[a], references_.upper[a], slices, kSlices, count, q);
-        for (uint32_t i = count; i < kSmallNode; ++i) {  // on no side of any plane
-            q.begin[i] = kPlanes;
-            q.end[i] = 0;
-        }
+        Quantised<kCapacity> q;
+        quantise<true>(df, lowers, uppers, slices, kSlices, count, q);
         for (int j = 0; j < kPlanes; j += static_cast<int>(hn::Lanes(df))) {
-            hn::Store(slice_positions(df, lower, upper, j, kSlices), df, positions + j);
+            hn::Store(slice_positions(df, lower, upper, j), df, positions + j);
         }
-        for (int j = 0; j < kPlanes; ++j) {
-            uint64_t begins_before = 0;
-            uint64_t ends_behind = 0;
-            for (size_t i = 0; i < kSmallNode; i += hn::Lanes(d8)) {
-                const auto begin = hn::Load(d8, reinterpret_cast<const int8_t*>(q.begin) + i);
-                const auto end = hn::Load(d8, reinterpret_cast<const int8_t*>(q.end) + i);
-                const auto plane = hn::Set(d8, static_cast<int8_t>(j));
-                const auto before = hn::Set(d8, static_cast<int8_t>(j - 1));
-                uint8_t bytes[2][8] = {};
-                hn::StoreMaskBits(d8, hn::Lt(begin, plane), bytes[0]);
-                hn::StoreMaskBits(d8, hn::Gt(end, before), bytes[1]);
-                uint64_t bits[2];
-                std::memcpy(bits, bytes, sizeof bits);
-                begins_before |= bits[0] << i;
-                ends_behind |= bits[1] << i;
+        for (int j = 0; j < kSlices; ++j) {
+            const auto plane = hn::Set(d8, static_cast<int8_t>(j));
+            const auto before = hn::Set(d8, static_cast<int8_t>(j - 1));
+            for (size_t i = 0; i < kCapacity; i += hn::Lanes(d8)) {
+                const auto begin = hn::Load(d8, q.begin + i);
+                const auto end = hn::Load(d8, q.end + i);
+                store_bits(d8, hn::Lt(begin, plane), i, j, left);
+                store_bits(d8, hn::Gt(end, before), i, j, right);
             }
-            left[j] = begins_before;
-            right[j] = ends_behind;
         }
         // The last plane is the end of the tight box: all lie before it, even what lies in it.
-        left[kSlices] = ~uint64_t{0};
-        right[kSlices] = 0;
+        for (size_t w = 0; w < kWords; ++w) {
+            left[w][kSlices] = ~0U;
+            right[w][kSlices] = 0;
+        }
     }
 
-    using D64 = hn::ScalableTag<uint64_t>;
-    using DF = hn::Rebind<float, D64>;
+    template <class D>
+    static HWY_INLINE void store_bits(D d, hn::Mask<D> mask, size_t first, int plane,
+                                      uint32_t (&masks)[kWords][kPlanes]) {
+        const uint64_t bits = mask_bits(d, mask);
+        if constexpr (hn::MaxLanes(D()) == 16) {
+            uint32_t& word = masks[first / 32][plane];
+            word = first % 32 == 0 ? static_cast<uint32_t>(bits) : word | static_cast<uint32_t>(bits << 16);
+        } else {
+            for (size_t k = 0; k < hn::MaxLanes(D()) / 32; ++k) {
+                masks[first / 32 + k][plane] = static_cast<uint32_t>(bits >> (32 * k));
+            }
+        }
+    }
+
+    /// The boxes reference by reference, upper bounds negated: a union is two minima.
+    HWY_INLINE void store_boxes(const References& references, uint32_t count) {
+        const hn::CappedTag<float, 16> d;
+        for (uint32_t i = 0; i < count; i += static_cast<uint32_t>(hn::Lanes(d))) {
+            hn::StoreInterleaved4(hn::LoadU(d, references.lower[0] + i), hn::LoadU(d, references.lower[1] + i),
+                                  hn::LoadU(d, references.lower[2] + i), hn::Zero(d), d, lowers_[i]);
+            hn::StoreInterleaved4(hn::Neg(hn::LoadU(d, references.upper[0] + i)),
+                                  hn::Neg(hn::LoadU(d, references.upper[1] + i)),
+                                  hn::Neg(hn::LoadU(d, references.upper[2] + i)), hn::Zero(d), d, uppers_[i]);
+        }
+    }
+
+    using DF = hn::CappedTag<float, 16>;
 
     /// The cheapest plane inside the cell.
-    HWY_INLINE CheapestPlane<DF> cheapest_plane(uint64_t members, const SplitCosts<DF>& costs,
+    HWY_INLINE CheapestPlane<DF> cheapest_plane(const Members<kWords>& members, const SplitCosts<DF>& costs,
                                                 uint64_t affordable) const {
-        const D64 d64;
         const DF df;
         const hn::RebindToUnsigned<DF> du;
         const hn::RebindToSigned<DF> di;
-        const auto member_bits = hn::Set(d64, members);
         const auto round_up = hn::Set(du, kBlockSize - 1);
-        const auto too_many = hn::Set(di, static_cast<int32_t>(std::min<uint64_t>(affordable, 2 * kSmallNode) + 1));
+        const auto too_many = hn::Set(di, static_cast<int32_t>(std::min<uint64_t>(affordable, 2 * kCapacity) + 1));
         CheapestPlane cheapest(df);
         for (int axis = 0; axis < 3; ++axis) {
-            for (int j = 0; j < kPlanes; j += static_cast<int>(hn::Lanes(d64))) {
-                const int at = axis * kPlanes + j;
-                const auto left =
-                    hn::TruncateTo(du, hn::PopulationCount(hn::And(hn::Load(d64, left_ + at), member_bits)));
-                const auto right =
-                    hn::TruncateTo(du, hn::PopulationCount(hn::And(hn::Load(d64, right_ + at), member_bits)));
+            for (int j = 0; j < kPlanes; j += static_cast<int>(hn::Lanes(df))) {
+                auto left = hn::Zero(du);
+                auto right = hn::Zero(du);
+                for (size_t w = 0; w < kWords; ++w) {
+                    const auto member_bits = hn::Set(du, members.word[w]);
+                    const auto of = [&](const PlaneMasks& masks) {
+                        return hn::PopulationCount(hn::And(hn::Load(du, masks[axis][w] + j), member_bits));
+                    };
+                    left = hn::Add(left, of(left_));
+                    right = hn::Add(right, of(right_));
+                }
                 const auto left_blocks = hn::ConvertTo(df, hn::BitCast(di, hn::ShiftRight<3>(hn::Add(left, round_up))));
                 const auto right_blocks =
                     hn::ConvertTo(df, hn::BitCast(di, hn::ShiftRight<3>(hn::Add(right, round_up))));
-                const auto cost = costs(axis, hn::Load(df, positions_ + at), left_blocks, right_blocks);
+                const auto cost = costs(axis, hn::Load(df, positions_[axis] + j), left_blocks, right_blocks);
                 const auto is_affordable = hn::Lt(hn::BitCast(di, hn::Add(left, right)), too_many);
-                cheapest.offer(at, hn::IfThenElse(hn::RebindMask(df, is_affordable), cost, hn::Inf(df)));
+                cheapest.offer(axis * kPlanes + j, hn::IfThenElse(hn::RebindMask(df, is_affordable), cost, hn::Inf(df)));
             }
         }
         return cheapest;
     }
 
+    static Members<kWords> on_side(const Members<kWords>& members, const PlaneMasks& masks, int axis, int plane) {
+        Members<kWords> side;
+        for (size_t w = 0; w < kWords; ++w) {
+            side.word[w] = members.word[w] & masks[axis][w][plane];
+        }
+        return side;
+    }
+
     /// Builds below a set of references; returns the cost of what was built, per ray that meets the cell.
-    float split(uint64_t members, const OpenNode& node) {
+    float split(const Members<kWords>& members, const OpenNode& node) {
         const float leaf_cost = block_cost_ * static_cast<float>(block_count(node.count));
-        const CellShape shape(node.cell);
         // A leaf of one block is cheaper than any step.
-        if (leaf_cost <= traversal_cost_ || node.depth >= parameters_.sah.max_depth || !shape.is_splittable()) {
+        if (leaf_cost <= traversal_cost_ || node.depth >= parameters_.sah.max_depth) {
+            write_leaf(members, node);
+            return leaf_cost;
+        }
+        const CellShape shape(node.cell);
+        if (!shape.is_splittable()) {
             write_leaf(members, node);
             return leaf_cost;
         }
@@ -150,17 +197,14 @@ class SmallNode {
             write_leaf(members, node);
             return leaf_cost;
         }
-        const int plane = cheapest.index();
-        const Split split_at{plane / kPlanes, positions_[plane]};
-        const uint64_t left_members = members & left_[plane];
-        const uint64_t right_members = members & right_[plane];
-        const Partition parts{static_cast<uint32_t>(std::popcount(left_members)),
-                              static_cast<uint32_t>(std::popcount(right_members)),
-                              {},
-                              {}};
+        const int axis = cheapest.index() / kPlanes;
+        const int plane = cheapest.index() % kPlanes;
+        const Split split_at{axis, positions_[axis][plane]};
+        const Members<kWords> left_members = on_side(members, left_, axis, plane);
+        const Members<kWords> right_members = on_side(members, right_, axis, plane);
         OpenNode left;
         OpenNode right;
-        open_children(node, split_at, parts, left, right);
+        open_children(node, split_at, {left_members.count(), right_members.count(), {}, {}}, left, right);
 
         const size_t first_triangle = output_.triangle_count();
         const size_t index = output_.open_inner();
@@ -168,7 +212,7 @@ class SmallNode {
         const size_t right_child = output_.node_count();
         const float right_cost = split(right_members, right);
         const auto area = [&](const OpenNode& child) {
-            return hn::GetLane(costs.relative_area(split_at.axis, hn::Set(df, child.cell.size()[split_at.axis])));
+            return hn::GetLane(costs.relative_area(axis, hn::Set(df, child.cell.size()[axis])));
         };
         const float cost = traversal_cost_ + (area(left) * left_cost + area(right) * right_cost);
         if (leaf_cost <= cost) {  // the promise of the greedy choice was not kept: take the split back
@@ -180,23 +224,26 @@ class SmallNode {
         return cost;
     }
 
-    HWY_INLINE void write_leaf(uint64_t members, const OpenNode& node) {
+    HWY_INLINE void write_leaf(const Members<kWords>& members, const OpenNode& node) {
         uint32_t* next = output_.add_leaf(node.count);
-        const hn::CappedTag<float, 8> d;
-        constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<float, 8>());
-        alignas(64) float box[8];
-        std::fill(box, box + 8, std::numeric_limits<float>::infinity());
-        for (uint64_t rest = members; rest != 0; rest &= rest - 1) {
-            const auto i = static_cast<size_t>(std::countr_zero(rest));
-            *next++ = references_.triangle[i];
-            for (size_t k = 0; k < 8; k += kLanes) {
-                hn::Store(hn::Min(hn::Load(d, box + k), hn::Load(d, boxes_[i] + k)), d, box + k);
+        const hn::Full128<float> d;
+        auto lower = hn::Inf(d);
+        auto upper = hn::Inf(d);
+        for (size_t w = 0; w < kWords; ++w) {
+            for (uint32_t rest = members.word[w]; rest != 0; rest &= rest - 1) {
+                const size_t i = 32 * w + static_cast<size_t>(std::countr_zero(rest));
+                *next++ = triangles_[i];
+                lower = hn::Min(lower, hn::Load(d, lowers_[i]));
+                upper = hn::Min(upper, hn::Load(d, uppers_[i]));
             }
         }
+        alignas(16) float box[2][4];
+        hn::Store(lower, d, box[0]);
+        hn::Store(upper, d, box[1]);
         Box3f tight;
         for (int axis = 0; axis < 3; ++axis) {
-            tight.lower[axis] = std::max(box[axis], node.cell.lower[axis] - reach_[axis]) + 0.0F;
-            tight.upper[axis] = std::min(-box[axis + 4], node.cell.upper[axis] + reach_[axis]) + 0.0F;
+            tight.lower[axis] = std::max(box[0][axis], node.cell.lower[axis] - reach_[axis]) + 0.0F;
+            tight.upper[axis] = std::min(-box[1][axis], node.cell.upper[axis] + reach_[axis]) + 0.0F;
         }
         output_.last_box() = node.count == 0 ? Box3f{} : tight;
     }
@@ -204,13 +251,14 @@ class SmallNode {
     const BuildParameters& parameters_;
     float traversal_cost_;
     float block_cost_;
-    const References& references_;
+    const uint32_t* triangles_;
     SubtreeOutput& output_;
     float reach_[3];
-    alignas(64) float positions_[3 * kPlanes];
-    alignas(64) uint64_t left_[3 * kPlanes];
-    alignas(64) uint64_t right_[3 * kPlanes];
-    alignas(64) float boxes_[kSmallNode][8];  ///< lower bounds, then negated upper bounds: a union is one minimum
+    alignas(64) float positions_[3][kPlanes];
+    alignas(64) PlaneMasks left_;
+    alignas(64) PlaneMasks right_;
+    alignas(64) float lowers_[kCapacity][4];
+    alignas(64) float uppers_[kCapacity][4];
 };
 
 }  // namespace espalier::HWY_NAMESPACE

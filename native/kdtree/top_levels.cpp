@@ -21,9 +21,9 @@ uint32_t with_slack(uint32_t count) { return count + count / 4 + 2 * kMargin; }
 
 void add(const BinCounts& part, BinCounts& sum) {
     for (int axis = 0; axis < 3; ++axis) {
-        for (int j = 0; j < kMaxBins; ++j) {
+        for (int j = 0; j < kPlanes; ++j) {
             sum.left[axis][j] += part.left[axis][j];
-            sum.right[axis][j] += part.right[axis][j];
+            sum.ends_before[axis][j] += part.ends_before[axis][j];
         }
     }
 }
@@ -109,7 +109,7 @@ void TopLevels::choose_splits(const std::vector<uint32_t>& level, const std::vec
         const TopNode& top = nodes_[parts[i].node];
         const Segment& segment = top.segments[parts[i].segment];
         counts[i] = {};
-        kernels_.count_bins(segment.references, segment.count, top.node.tight, parameters_.bins, counts[i]);
+        kernels_.count_bins(segment.references, segment.count, top.node.tight, counts[i]);
     });
     size_t first = 0;
     for (const uint32_t node : level) {
