@@ -152,29 +152,32 @@ HWY_INLINE void count_below(const int8_t* values, uint32_t count, int first_boun
     }
 }
 
-inline void count_bins(const References& references, uint32_t count, const Box3f& range, BinCounts& counts) {
+inline void count_bins_along(int axis, const References& references, uint32_t count, float lower, float upper,
+                             BinCounts& counts) {
     const hn::ScalableTag<float> df;
     constexpr uint32_t kChunk = 1024;
     constexpr int kGroup = (kSlices - 1) / 2;  // planes whose counters stay in registers
     static_assert(kSlices % 2 == 1);
+    if (!Slices::can_be_cut(lower, upper)) {
+        return;
+    }
+    const Slices slices(lower, upper);
+    const auto a = static_cast<size_t>(axis);
+    for (uint32_t begin = 0; begin < count; begin += kChunk) {
+        const uint32_t size = std::min(kChunk, count - begin);
+        const uint32_t padded = (size + 63) / 64 * 64;
+        Quantised<kChunk> q;
+        quantise<false>(df, references.lower[a] + begin, references.upper[a] + begin, slices, kSlices - 1, size, q);
+        for (int j = 1; j < kSlices; j += kGroup) {
+            count_below<kGroup>(q.begin, padded, j, counts.left[axis]);
+            count_below<kGroup>(q.end, padded, j, counts.ends_before[axis]);
+        }
+    }
+}
+
+inline void count_bins(const References& references, uint32_t count, const Box3f& range, BinCounts& counts) {
     for (int axis = 0; axis < 3; ++axis) {
-        const Slices slices(range.lower[axis], range.upper[axis]);
-        if (slices.scale == 0) {
-            continue;
-        }
-        const auto a = static_cast<size_t>(axis);
-        uint32_t* left = counts.left[axis];
-        uint32_t* ends_before = counts.ends_before[axis];
-        for (uint32_t begin = 0; begin < count; begin += kChunk) {
-            const uint32_t size = std::min(kChunk, count - begin);
-            const uint32_t padded = (size + 63) / 64 * 64;
-            Quantised<kChunk> q;
-            quantise<false>(df, references.lower[a] + begin, references.upper[a] + begin, slices, kSlices - 1, size, q);
-            for (int j = 1; j < kSlices; j += kGroup) {
-                count_below<kGroup>(q.begin, padded, j, left);
-                count_below<kGroup>(q.end, padded, j, ends_before);
-            }
-        }
+        count_bins_along(axis, references, count, range.lower[axis], range.upper[axis], counts);
     }
 }
 
@@ -233,7 +236,28 @@ inline Split choose_split(const OpenNode& node, BinCounts& counts, const BuildPa
     const int axis = cheapest.index() / kPlanes;
     const int plane = cheapest.index() % kPlanes;
     const auto position = slice_positions(d, node.tight.lower[axis], node.tight.upper[axis], plane);
-    return {axis, hn::GetLane(position)};
+    return {axis, hn::GetLane(position), cheapest.cost()};
+}
+
+inline Split choose_finer_split(const OpenNode& node, Split split, Interval range, const BinCounts& counts,
+                                const BuildParameters& parameters) {
+    const hn::CappedTag<float, 16> d;
+    const CellShape shape(node.cell);
+    const SplitCosts costs(d, node, shape, parameters.sah);
+    CheapestPlane cheapest(d);
+    for (int j = 0; j <= kSlices; j += static_cast<int>(hn::Lanes(d))) {
+        // The ends lie among the planes that were tried before, and their counts are not known here.
+        const hn::RebindToSigned<decltype(d)> di;
+        const auto plane = hn::Iota(di, j);
+        const auto is_end = hn::Or(hn::Eq(plane, hn::Zero(di)), hn::Eq(plane, hn::Set(di, kSlices)));
+        const auto cost = slice_costs(d, costs, node, split.axis, range.lower, range.upper, counts, j);
+        cheapest.offer(j, hn::IfThenElse(hn::RebindMask(d, is_end), hn::Inf(d), cost));
+    }
+    if (!(cheapest.cost() < split.cost)) {
+        return split;
+    }
+    const auto position = slice_positions(d, range.lower, range.upper, cheapest.index());
+    return {split.axis, hn::GetLane(position), cheapest.cost()};
 }
 
 }  // namespace espalier::HWY_NAMESPACE

@@ -37,7 +37,12 @@ class SubtreeBuilder {
         }
         BinCounts counts{};
         count_bins(references, node.count, node.tight, counts);
-        const Split split = choose_split(node, counts, *input_.parameters);
+        Split split = choose_split(node, counts, *input_.parameters);
+        if (Interval range; finer_range(node, split, range)) {
+            BinCounts finer{};
+            count_bins_along(split.axis, references, node.count, range.lower, range.upper, finer);
+            split = choose_finer_split(node, split, range, finer, *input_.parameters);
+        }
         if (split.axis < 0) {
             write_leaf(node, references);
             return;
@@ -95,7 +100,8 @@ void build_subtree(const SubtreeInput& input, const OpenNode& node, SubtreeOutpu
     SubtreeBuilder(input, output).build(node, 0, node.count);
 }
 
-constexpr BuildKernels kKernels{make_references, count_bins, choose_split, partition, build_subtree, write_blocks};
+constexpr BuildKernels kKernels{make_references,    count_bins, count_bins_along, choose_split,
+                                choose_finer_split, partition,  build_subtree,    write_blocks};
 
 }  // namespace espalier::HWY_NAMESPACE
 HWY_AFTER_NAMESPACE();

@@ -17,7 +17,7 @@ struct BuildParameters {
 };
 
 /// A node of at most this many references is finished as one bit mask per plane and side.
-constexpr uint32_t kSmallNode = 64;
+constexpr uint32_t kSmallNode = 128;
 
 /// Along each axis the planes between so many slices of a node's tight box are tried, and both its ends: as many planes
 /// as the widest vector has lanes.
@@ -38,6 +38,10 @@ struct OpenNode {
 struct BinCounts {
     alignas(64) uint32_t left[3][kPlanes];
     alignas(64) uint32_t ends_before[3][kPlanes];
+};
+
+struct Interval {
+    float lower, upper;
 };
 
 struct Partition {
@@ -67,9 +71,15 @@ struct BuildKernels {
                                 Box3f& bounds, RejectedFaces& rejected);
     /// Adds part of a node's references to its counts.
     void (*count_bins)(const References& references, uint32_t count, const Box3f& tight, BinCounts& counts);
+    /// The same for one axis and the planes that cut an interval of it.
+    void (*count_bins_along)(int axis, const References& references, uint32_t count, float lower, float upper,
+                             BinCounts& counts);
     /// The plane of least cost by the surface area heuristic, or a leaf. Fills in the counts at the ends of the tight
     /// box.
     Split (*choose_split)(const OpenNode& node, BinCounts& counts, const BuildParameters& parameters);
+    /// The cheapest of a split and the planes that cut an interval around it.
+    Split (*choose_finer_split)(const OpenNode& node, Split split, Interval range, const BinCounts& counts,
+                                const BuildParameters& parameters);
     /// Sorts references by side, in order; those on both sides go to both. `left` may be `in` itself.
     Partition (*partition)(const TriangleSoup& soup, const References& in, uint32_t count, Split split, bool clip,
                            const References& left, const References& right);
@@ -102,6 +112,18 @@ inline bool cuts_empty_space(const OpenNode& node, Split split, Partition& parts
         return true;
     }
     return false;
+}
+
+/// Whether a better plane may lie between the chosen one's neighbours, and where they are.
+inline bool finer_range(const OpenNode& node, Split split, Interval& range) {
+    if (split.axis < 0) {
+        return false;
+    }
+    const float lower = node.tight.lower[split.axis];
+    const float upper = node.tight.upper[split.axis];
+    const float slice = (upper - lower) * (1.0F / kSlices);
+    range = {std::max(split.position - slice, lower), std::min(split.position + slice, upper)};
+    return lower < split.position && split.position < upper;
 }
 
 /// The two nodes that a split makes of one.

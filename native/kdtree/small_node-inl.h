@@ -163,7 +163,8 @@ class SmallNode {
                     hn::ConvertTo(df, hn::BitCast(di, hn::ShiftRight<3>(hn::Add(right, round_up))));
                 const auto cost = costs(axis, hn::Load(df, positions_[axis] + j), left_blocks, right_blocks);
                 const auto is_affordable = hn::Lt(hn::BitCast(di, hn::Add(left, right)), too_many);
-                cheapest.offer(axis * kPlanes + j, hn::IfThenElse(hn::RebindMask(df, is_affordable), cost, hn::Inf(df)));
+                cheapest.offer(axis * kPlanes + j,
+                               hn::IfThenElse(hn::RebindMask(df, is_affordable), cost, hn::Inf(df)));
             }
         }
         return cheapest;
@@ -199,7 +200,7 @@ class SmallNode {
         }
         const int axis = cheapest.index() / kPlanes;
         const int plane = cheapest.index() % kPlanes;
-        const Split split_at{axis, positions_[axis][plane]};
+        const Split split_at{axis, positions_[axis][plane], cheapest.cost()};
         const Members<kWords> left_members = on_side(members, left_, axis, plane);
         const Members<kWords> right_members = on_side(members, right_, axis, plane);
         OpenNode left;

@@ -17,6 +17,7 @@ namespace espalier {
 struct Split {
     int axis = -1;  ///< -1: the node is a leaf
     float position = 0;
+    float cost = 0;
 };
 
 /// The subtrees that one thread builds: nodes depth first, the tight box of each, and the triangles of the leaves in

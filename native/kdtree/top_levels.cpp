@@ -104,21 +104,45 @@ void TopLevels::split_above(uint32_t cut) {
 }
 
 void TopLevels::choose_splits(const std::vector<uint32_t>& level, const std::vector<Part>& parts) {
-    std::vector<BinCounts> counts(parts.size());
+    count_parts(parts, [&](const TopNode& top, const Segment& segment, BinCounts& counts) {
+        kernels_.count_bins(segment.references, segment.count, top.node.tight, counts);
+    });
+    for_each_node(level, [&](TopNode& top, BinCounts& counts) {
+        top.split = kernels_.choose_split(top.node, counts, parameters_);
+    });
+    count_parts(parts, [&](const TopNode& top, const Segment& segment, BinCounts& counts) {
+        if (Interval range; finer_range(top.node, top.split, range)) {
+            kernels_.count_bins_along(top.split.axis, segment.references, segment.count, range.lower, range.upper,
+                                      counts);
+        }
+    });
+    for_each_node(level, [&](TopNode& top, BinCounts& counts) {
+        if (Interval range; finer_range(top.node, top.split, range)) {
+            top.split = kernels_.choose_finer_split(top.node, top.split, range, counts, parameters_);
+        }
+    });
+}
+
+template <class F>
+void TopLevels::count_parts(const std::vector<Part>& parts, const F& count) {
+    counts_.resize(parts.size());
     parallel_for(threads_, parts.size(), [&](size_t i) {
         const TopNode& top = nodes_[parts[i].node];
-        const Segment& segment = top.segments[parts[i].segment];
-        counts[i] = {};
-        kernels_.count_bins(segment.references, segment.count, top.node.tight, counts[i]);
+        counts_[i] = {};
+        count(top, top.segments[parts[i].segment], counts_[i]);
     });
+}
+
+template <class F>
+void TopLevels::for_each_node(const std::vector<uint32_t>& level, const F& choose) {
     size_t first = 0;
     for (const uint32_t node : level) {
         TopNode& top = nodes_[node];
         BinCounts sum{};
         for (const size_t end = first + top.segments.size(); first < end; ++first) {
-            add(counts[first], sum);
+            add(counts_[first], sum);
         }
-        top.split = kernels_.choose_split(top.node, sum, parameters_);
+        choose(top, sum);
     }
 }
 

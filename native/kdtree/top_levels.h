@@ -62,6 +62,12 @@ class TopLevels {
     };
     std::vector<Part> parts_of(const std::vector<uint32_t>& nodes) const;
     void choose_splits(const std::vector<uint32_t>& level, const std::vector<Part>& parts);
+    /// Counts the references of each part, all threads together.
+    template <class F>
+    void count_parts(const std::vector<Part>& parts, const F& count);
+    /// Calls choose(node, sum of its parts' counts) for each node of a level.
+    template <class F>
+    void for_each_node(const std::vector<uint32_t>& level, const F& choose);
     std::vector<uint32_t> open_level(const std::vector<uint32_t>& level, const std::vector<Part>& parts);
     Partition partition_segment(const TopNode& node, const Segment& segment, const References& scratch, Segment& left,
                                 Segment& right);
@@ -74,6 +80,7 @@ class TopLevels {
     const uint32_t segment_size_;
     SegmentMemory memory_;
     std::vector<TopNode> nodes_;
+    std::vector<BinCounts> counts_;  ///< per part
     RejectedFaces rejected_;
 };
 
