@@ -143,29 +143,6 @@ def test_blenders_own_command_draws_no_start_up_scene(
     assert command([*words, str(blend)]) == 0
 
 
-def test_blenders_own_command_draws_no_start_up_scene(
-    stage: Stage, blend: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from addon import cli
-
-    commands = {}
-    monkeypatch.setattr(stage.bpy.utils, "register_cli_command", commands.__setitem__)
-    cli.register()
-    command = commands["espalier"]
-    picture = tmp_path / "out.png"
-    words = ["preview", "--output", str(picture), "--threads", "1", *SMALL]
-    assert command(words) == 0  # the file is open
-
-    picture.unlink()
-    stage.bpy.ops.wm.read_homefile(use_factory_startup=True)
-    assert stage.bpy.context.scene.camera is not None
-    assert command(words) == 1
-    assert "no file is open" in capfd.readouterr().err
-    assert not picture.exists()
-    assert cli.main(words) == 0  # a script knows what is in memory
-    assert command([*words, str(blend)]) == 0
-
-
 def test_failures_are_1_with_the_reason_on_standard_error(blend: Path, tmp_path: Path) -> None:
     broken = tmp_path / "broken.blend"
     broken.write_text("this is no Blender file")

@@ -385,29 +385,6 @@ def test_a_group_socket_that_is_called_a_colour_is_none(stage: Stage, name: str,
     assert base_color(material) == pytest.approx((0.9, 0.8, 0.7))
 
 
-@pytest.mark.parametrize("kind", ["NodeSocketFloat", "NodeSocketVector", "NodeSocketShader"])
-@pytest.mark.parametrize("name", ["Color", "Base Color"])
-def test_a_group_socket_that_is_called_a_colour_is_none(stage: Stage, name: str, kind: str) -> None:
-    from addon.export import base_color
-
-    material = stage.material("Grouped", (0.1, 0.2, 0.3))
-    material.diffuse_color = (0.5, 0.6, 0.7, 1.0)
-    nodes = material.node_tree.nodes
-    nodes.remove(next(node for node in nodes if node.type == "BSDF_PRINCIPLED"))
-    inner = stage.bpy.data.node_groups.new("Inner", "ShaderNodeTree")
-    inner.interface.new_socket("Shader", in_out="OUTPUT", socket_type="NodeSocketShader")
-    inner.interface.new_socket(name, in_out="INPUT", socket_type=kind)
-    group = nodes.new("ShaderNodeGroup")
-    group.node_tree = inner
-    output = next(node for node in nodes if node.type == "OUTPUT_MATERIAL")
-    material.node_tree.links.new(group.outputs["Shader"], output.inputs["Surface"])
-    assert base_color(material) == pytest.approx((0.5, 0.6, 0.7))
-
-    inner.interface.new_socket(name, in_out="INPUT", socket_type="NodeSocketColor")
-    group.inputs[1].default_value = (0.9, 0.8, 0.7, 1.0)
-    assert base_color(material) == pytest.approx((0.9, 0.8, 0.7))
-
-
 def test_base_colours(stage: Stage) -> None:
     from addon.export import base_color
 

@@ -117,15 +117,6 @@ def test_command_of_the_real_blender(drawn: Callable[[Blender], Path]) -> None:
         assert "no file is open" in done.stderr
         assert not picture.exists()
 
-        done = folder.run("blender", "-b", "-c", "espalier", "preview", scene, *outputs, "--threads", "1,2")
-        assert done.returncode == 0, said(done)
-        assert picture.read_bytes() == (files / "cli.png").read_bytes()
-
-        picture.unlink()
-        done = folder.run("blender", "-b", "/missing.blend", "-c", "espalier", "preview", *outputs)
-        assert done.returncode == 1, said(done)
-        assert not picture.exists()
-
         done = espalier("preview", *outputs, "--threads", "0")
         assert done.returncode == 2, said(done)
         assert "--threads" in done.stderr

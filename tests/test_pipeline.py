@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 import time
 from contextlib import nullcontext
-from contextlib import nullcontext
 from math import nan
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -399,155 +398,6 @@ def test_undo_does_not_take_the_picture_away(addon: ModuleType, cube: Stage, mon
     assert picture.NAME in bpy.data.images
 
 
-class Watcher:
-    """Blender's part while an operator is at work in a window: the operator's own methods, and what it asks for."""
-
-    def __init__(self, addon: ModuleType, stage: Stage) -> None:
-        operators = addon.operators
-        self.asked: list[str] = []
-        self.told: list[tuple[set[str], str]] = []
-
-        class Operator(operators._Watched):  # type: ignore[misc, name-defined]
-            kind = operators.PREVIEW
-            present = operators.ESPALIER_OT_preview.present
-
-            def report(operator, kind: set[str], text: str) -> None:  # noqa: N805
-                self.told.append((kind, text))
-
-        manager = SimpleNamespace(
-            windows=[],
-            event_timer_add=lambda *_, **__: "timer",
-            event_timer_remove=lambda timer: self.asked.append(f"remove {timer}"),
-            modal_handler_add=lambda _: None,
-            progress_begin=lambda *_: None,
-            progress_update=lambda _: None,
-            progress_end=lambda: self.asked.append("progress_end"),
-        )
-        self.context = SimpleNamespace(
-            scene=stage.scene,
-            view_layer=stage.bpy.context.view_layer,
-            evaluated_depsgraph_get=stage.bpy.context.evaluated_depsgraph_get,
-            window=SimpleNamespace(),
-            window_manager=manager,
-            workspace=SimpleNamespace(status_text_set=lambda text: self.asked.append(f"status {text}")),
-        )
-        self.operator: Any = Operator()
-
-    def start(self, operators: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
-        app = SimpleNamespace(background=False)
-        monkeypatch.setattr(operators, "bpy", SimpleNamespace(**{**vars(operators.bpy), "app": app}))
-        assert self.operator.invoke(self.context, None) == {"RUNNING_MODAL"}
-        return operators.at_work()
-
-    def tick(self) -> set[str]:
-        done: set[str] = self.operator.modal(self.context, SimpleNamespace(type="TIMER", value="NOTHING"))
-        return done
-
-
-@pytest.mark.parametrize("when", ["at work", "done"])
-def test_an_error_in_the_window_ends_the_run_and_frees_the_buttons(
-    addon: ModuleType, cube: Stage, monkeypatch: pytest.MonkeyPatch, when: str
-) -> None:
-    from addon import operators, picture
-
-    good = np.full((48, 64, 4), 0.25, np.float32)
-    picture.show(good)
-    if when == "at work":
-        cube.scene.espalier.samples = ENDLESS
-        cube.scene.render.resolution_percentage = 1000
-    watcher = Watcher(addon, cube)
-    session = watcher.start(operators, monkeypatch)
-
-    def fail(*_: Any) -> bool:
-        raise RuntimeError("no area for you")
-
-    monkeypatch.setattr(picture, "open_editor", fail)
-    if when == "done":
-        assert session.run.wait(30.0)
-    end = time.monotonic() + 30.0
-    while (outcome := watcher.tick()) == {"PASS_THROUGH"} and time.monotonic() < end:
-        time.sleep(0.05)
-    assert outcome == {"CANCELLED"}
-    assert ({"ERROR"}, "no area for you") in watcher.told
-    assert watcher.asked[-3:] == ["remove timer", "progress_end", "status None"]
-    assert session.run.done
-    assert operators.at_work() is None
-    if when == "at work":
-        np.testing.assert_array_equal(remembered(), good)
-    else:
-        assert np.abs(remembered() - good).max() > 0.1  # the new picture is whole, only no area shows it
-
-
-def test_unregistering_ends_the_run_without_its_operator(
-    addon: ModuleType, cube: Stage, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from addon import operators
-
-    cube.scene.espalier.samples = ENDLESS
-    cube.scene.render.resolution_percentage = 1000
-    watcher = Watcher(addon, cube)
-    with monkeypatch.context() as window:
-        session = watcher.start(operators, window)
-    assert operators.at_work() is session
-    monkeypatch.setattr(operators, "tidy", lambda _, tidy=operators.tidy: tidy(watcher.context))
-    del watcher.operator.session  # freed
-    addon.unregister()
-    try:
-        assert session.run.done
-        assert watcher.asked == ["remove timer", "progress_end", "status None"]
-        assert operators.at_work() is None
-    finally:
-        addon.register()
-
-
-@pytest.mark.parametrize("why", ["maximised", "poll"])
-def test_what_cannot_be_split_is_left_alone(
-    addon: ModuleType, cube: Stage, monkeypatch: pytest.MonkeyPatch, why: str
-) -> None:
-    from addon import picture
-
-    image = picture.show(np.zeros((2, 2, 4), np.float32))
-
-    class Split:
-        poll = staticmethod(lambda: why != "poll")
-
-        def __call__(self, **_: Any) -> None:
-            raise RuntimeError("Operator bpy.ops.screen.area_split.poll() failed, context is incorrect")
-
-    ops = SimpleNamespace(screen=SimpleNamespace(area_split=Split()))
-    monkeypatch.setattr(picture, "bpy", SimpleNamespace(**{**vars(picture.bpy), "ops": ops}))
-    area = SimpleNamespace(
-        type="VIEW_3D", ui_type="VIEW_3D", width=9, height=9, regions=[SimpleNamespace(type="WINDOW")]
-    )
-    screen = SimpleNamespace(show_fullscreen=why == "maximised", areas=[area])
-    window = SimpleNamespace(screen=screen)
-    context: Any = SimpleNamespace(
-        window=window,
-        window_manager=SimpleNamespace(windows=[window]),
-        temp_override=lambda **_: nullcontext(),
-    )
-    assert not picture.open_editor(context, image)
-    assert not picture.is_shown(context, image)
-
-
-def test_undo_does_not_take_the_picture_away(addon: ModuleType, cube: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
-    from addon import operators, picture
-
-    bpy = cube.bpy
-    bpy.ops.ed.undo_push(message="before")
-    watcher = Watcher(addon, cube)
-    with monkeypatch.context() as window:
-        window.setattr(picture, "open_editor", lambda *_: False)
-        session = watcher.start(operators, window)
-        assert session.run.wait(30.0)
-        assert watcher.tick() == {"FINISHED"}
-    bpy.context.scene.render.resolution_x = 77
-    bpy.ops.ed.undo_push(message="an edit")
-    bpy.ops.ed.undo()
-    assert bpy.context.scene.render.resolution_x == 64
-    assert picture.NAME in bpy.data.images
-
-
 def test_the_picture_file_has_the_view_transform_and_leaves_the_settings_alone(cube: Stage, tmp_path: Path) -> None:
     from addon import picture
 
@@ -607,14 +457,6 @@ def test_f12_draws_the_same_picture_with_render_settings(addon: ModuleType, cube
     assert np.abs(drawn - viewport).max() > 0.1
     cube.scene.objects["Render only"].hide_viewport = False
     np.testing.assert_allclose(finished(run_of(cube, samples=2)).image, drawn, atol=1e-6)
-
-
-def test_f12_keeps_the_scenes_resolution(addon: ModuleType, cube: Stage, tmp_path: Path) -> None:
-    cube.scene.render.engine = "ESPALIER"
-    whole = rendered(cube, tmp_path / "whole.exr")
-    for percentage in (50, 200):
-        cube.scene.espalier.use_percentage, cube.scene.espalier.percentage = True, percentage
-        np.testing.assert_array_equal(rendered(cube, tmp_path / f"{percentage}.exr"), whole)
 
 
 def test_f12_keeps_the_scenes_resolution(addon: ModuleType, cube: Stage, tmp_path: Path) -> None:
