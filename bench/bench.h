@@ -28,6 +28,7 @@ struct Mode {
 };
 inline constexpr std::array kModes{Mode{"draft", Quality::kDraft}, Mode{"balanced", Quality::kBalanced},
                                    Mode{"best", Quality::kBest}};
+constexpr size_t kDefaultMode = 1;
 
 /// How a mesh is looked at: a square pinhole picture and one point light.
 struct View {
@@ -98,7 +99,7 @@ inline void take_turns(std::vector<Contestant>& contestants, double seconds) {
     const auto drops_out = [&](const Contestant& contestant) {
         const double spent = std::accumulate(contestant.ms.begin(), contestant.ms.end(), 0.0);
         return !contestant.ms.empty() &&
-               (contestant.ms[0] > available / 3 || (contestant.ms.size() >= kLeast && spent > available / 4));
+               (contestant.ms[0] > available / 2 || (contestant.ms.size() >= kLeast && spent > available / 4));
     };
     const Stopwatch watch;
     for (int turn = 0; turn < kMost && (turn < kLeast || watch.ms() < available); ++turn) {
@@ -110,6 +111,14 @@ inline void take_turns(std::vector<Contestant>& contestants, double seconds) {
             }
         }
     }
+}
+
+inline Json rows_of(const std::vector<Contestant>& contestants) {
+    Json rows;
+    for (const Contestant& contestant : contestants) {
+        rows.push_back({{"name", contestant.name}, {"threads", contestant.threads}, {"ms", contestant.ms}});
+    }
+    return rows;
 }
 
 }  // namespace espalier::bench

@@ -143,7 +143,7 @@ Json memory_in_child(const std::string& name, int threads, const WarmUp& warm_up
     if (!read) {
         throw std::runtime_error("the child process that measures the memory of " + name + " failed");
     }
-    return {{"builder", name}, {"threads", threads}, {"peak_mb", mb[0]}, {"kept_mb", mb[1]}};
+    return {{"name", name}, {"threads", threads}, {"peak_mb", mb[0]}, {"kept_mb", mb[1]}};
 }
 
 }  // namespace
@@ -189,13 +189,9 @@ Json compare_builds(const Mesh& mesh, int threads, double seconds) {
     }
     take_turns(contestants, seconds);
 
-    Json rows;
-    for (size_t i = 0; i < contestants.size(); ++i) {
-        Json& row = rows.emplace_back(
-            Json{{"builder", contestants[i].name}, {"threads", contestants[i].threads}, {"ms", contestants[i].ms}});
-        if (i < ours.size()) {
-            row["phases_ms"] = ours[i].phases_ms();
-        }
+    Json rows = rows_of(contestants);
+    for (size_t i = 0; i < ours.size(); ++i) {
+        rows[i]["phases_ms"] = ours[i].phases_ms();
     }
     return {{"threads", threads}, {"rows", rows}};
 }

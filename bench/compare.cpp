@@ -1,17 +1,17 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 // espalier_bench MESH SECONDS PART...: one mesh beside Embree, as JSON on standard output. MESH is a file that run.py
-// wrote; SECONDS go to each group of contestants; parts are memory, quality and builds. The instruction set of both
-// sides is what ESPALIER_SIMD says. Without arguments: the instruction sets that this machine runs.
+// wrote; SECONDS go to each group of contestants; parts are memory, quality, builds, rays and preview. The instruction
+// set of both sides is what ESPALIER_SIMD says. Without arguments: the instruction sets that this machine runs.
 #include "compare.h"
 
 #include <malloc.h>
-#include <pmmintrin.h>
-#include <xmmintrin.h>
 
 #include <cstdio>
 #include <exception>
 #include <iostream>
 #include <set>
+
+#include "embree_rays.h"
 
 namespace espalier::bench {
 namespace {
@@ -21,9 +21,7 @@ Json compare(const std::string& path, double seconds, const std::set<std::string
     // to keep those that were freed.
     mallopt(M_MMAP_THRESHOLD, 128 * 1024);
     mallopt(M_TRIM_THRESHOLD, 128 * 1024);
-    // As Embree asks of its callers; our side sets and restores its own.
-    _MM_SET_FLUSH_ZERO_MODE(_MM_FLUSH_ZERO_ON);
-    _MM_SET_DENORMALS_ZERO_MODE(_MM_DENORMALS_ZERO_ON);
+    const FlushToZero as_embree_asks;  // our side sets and restores its own
 
     const Mesh mesh = read_mesh(path);
     const int all = hardware_threads();
@@ -42,6 +40,12 @@ Json compare(const std::string& path, double seconds, const std::set<std::string
         for (const int threads : std::set{1, all}) {
             result["builds"].push_back(compare_builds(mesh, threads, seconds));
         }
+    }
+    if (parts.contains("rays")) {
+        result["rays"] = compare_rays(mesh, all, seconds);
+    }
+    if (parts.contains("preview")) {
+        result["preview"] = compare_previews(mesh, all, seconds);
     }
     return result;
 }

@@ -15,4 +15,11 @@ Json compare_builds(const Mesh& mesh, int threads, double seconds);
 /// What the trees of our modes cost in two surface-area models, and their sizes.
 Json compare_quality(const Mesh& mesh);
 
+/// Milliseconds per set of rays: on the trees of our modes, the default one also with a single thread, and for Embree's
+/// calls; steps per ray, and the rays where the faces differ.
+Json compare_rays(const Mesh& mesh, int threads, double seconds);
+
+/// Milliseconds from triangles in memory to a picture with one light and its shadows.
+Json compare_previews(const Mesh& mesh, int threads, double seconds);
+
 }  // namespace espalier::bench

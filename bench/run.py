@@ -32,7 +32,7 @@ SHARED = ROOT.parent / "shared/meshes"
 MESHES = ("sponza", "bunny", "armadillo", "dragon")  # .npz files
 SCENES = ("sculpture",)  # shipped ones, exported as the world's triangles
 INTERIORS = {"sponza"}  # looked at from within
-PARTS = ("memory", "quality", "builds")
+PARTS = ("memory", "quality", "builds", "rays", "preview")
 QUIET_LOAD = 0.3
 
 Points = NDArray[np.float32]

@@ -8,11 +8,13 @@ from statistics import median
 from typing import Any
 
 Times = Sequence[float]  # milliseconds of each turn
+DEFAULT_MODE = "balanced"
 
 ABOUT = (
-    "Contestants take turns in one process; times are medians (least to greatest), ratios are medians of the ratios "
-    "within a turn. Both sides get fresh memory while the clock runs, the same threads and the same instruction set. "
-    "Embree LOW and MEDIUM build a ROBUST scene, HIGH one that is not, since ROBUST turns its spatial splits off."
+    "Contestants take turns in one process. Times are medians (least to greatest); ratios are medians of the ratios "
+    "within a turn and tell how many times as fast one is as the other. Both sides get fresh memory while the clock "
+    "runs, the same threads and the same instruction set. Embree LOW and MEDIUM build a ROBUST scene, HIGH one that is "
+    "not, since ROBUST turns its spatial splits off."
 )
 
 
@@ -29,9 +31,21 @@ def spread(ms: Times) -> str:
     return f"{median(ms):.2f} ({min(ms):.2f} to {max(ms):.2f})"
 
 
-def ratio(over: Times, under: Times) -> float:
-    """The median ratio of two contestants within a turn; one may have had fewer turns"""
-    return median(a / b for a, b in zip(over, under, strict=False))
+def ratios(over: Times, under: Times) -> list[float]:
+    """The ratio of two contestants in each turn; one may have had fewer turns"""
+    return [a / b for a, b in zip(over, under, strict=False)]
+
+
+def times_of(group: dict[str, Any]) -> dict[tuple[str, int], Times]:
+    """The times of a group's contestants by name and thread count"""
+    return {(row["name"], row["threads"]): row["ms"] for row in group["rows"]}
+
+
+def efficiency(times: dict[tuple[str, int], Times], name: str, threads: int) -> str:
+    """Speed-up over one thread, by the number of threads; nothing where one thread was all"""
+    if threads == 1 or (name, 1) not in times:
+        return ""
+    return f"{median(ratios(times[name, 1], times[name, threads])) / threads:.2f}"
 
 
 def per_simd(report: dict[str, Any], part: str) -> dict[str, list[tuple[str, dict[str, Any]]]]:
@@ -49,12 +63,11 @@ def build_rows(meshes: list[tuple[str, dict[str, Any]]]) -> Iterable[Sequence[ob
     for mesh, measured in meshes:
         for group in measured["builds"]:
             threads = group["threads"]
-            times = {(row["builder"], row["threads"]): row["ms"] for row in group["rows"]}
+            times = times_of(group)
             medium = times["Embree MEDIUM", threads]
             for (builder, count), ms in times.items():
                 if count != threads:
                     continue  # the serial builder beside the parallel one, for the efficiency alone
-                serial = times.get((builder, 1)) if threads > 1 else None
                 yield (
                     mesh,
                     threads,
@@ -62,8 +75,8 @@ def build_rows(meshes: list[tuple[str, dict[str, Any]]]) -> Iterable[Sequence[ob
                     spread(ms),
                     len(ms),
                     f"{measured['triangles'] / median(ms) / 1e3:.2f}",
-                    f"{ratio(medium, ms):.2f}",
-                    f"{ratio(serial, ms) / threads:.2f}" if serial else "",
+                    f"{median(ratios(medium, ms)):.2f}",
+                    efficiency(times, builder, threads),
                 )
 
 
@@ -77,7 +90,7 @@ def phase_table(meshes: list[tuple[str, dict[str, Any]]]) -> str:
                 if "phases_ms" in row and row["threads"] == group["threads"]:
                     names = list(row["phases_ms"])
                     phases = [f"{median(ms):.2f}" for ms in row["phases_ms"].values()]
-                    rows.append((mesh, group["threads"], row["builder"], *phases))
+                    rows.append((mesh, group["threads"], row["name"], *phases))
     return table(" | ".join(["mesh", "threads", "mode", *names]), rows)
 
 
@@ -107,17 +120,60 @@ def quality_rows(meshes: list[tuple[str, dict[str, Any]]]) -> Iterable[Sequence[
 def memory_rows(meshes: list[tuple[str, dict[str, Any]]]) -> Iterable[Sequence[object]]:
     """One row per mesh and builder"""
     for mesh, measured in meshes:
-        medium = next(row for row in measured["memory"] if row["builder"] == "Embree MEDIUM")
+        medium = next(row for row in measured["memory"] if row["name"] == "Embree MEDIUM")
         for row in measured["memory"]:
             yield (
                 mesh,
-                row["builder"],
+                row["name"],
                 f"{row['peak_mb']:.1f}",
                 f"{row['kept_mb']:.1f}",
                 f"{row['kept_mb'] * 2**20 / measured['triangles']:.0f}",
                 f"{row['peak_mb'] / medium['peak_mb']:.2f}",
                 f"{row['kept_mb'] / medium['kept_mb']:.2f}",
             )
+
+
+def ray_table(meshes: list[tuple[str, dict[str, Any]]]) -> str:
+    """One row per mesh and set of rays; ours with the wide nodes and triangle blocks that a ray visits"""
+    groups = [(mesh, group) for mesh, measured in meshes for group in measured["rays"]]
+    names = list(dict.fromkeys(row["name"] for _, group in groups for row in group["rows"]))
+    rows = []
+    for mesh, group in groups:
+        threads, times = group["threads"], times_of(group)
+        steps = {row["name"]: row["steps"] for row in group["rows"] if "steps" in row}
+
+        def cell(name: str, group: dict[str, Any] = group, times: Any = times, steps: Any = steps) -> str:
+            if (name, group["threads"]) not in times:
+                return ""
+            speed = f"{group['rays'] / median(times[name, group['threads']]) / 1e3:.2f}"
+            return speed + (f" ({steps[name]['nodes']:.1f}, {steps[name]['blocks']:.1f})" if name in steps else "")
+
+        ours = times[DEFAULT_MODE, threads]
+        peers = [ms for (name, _), ms in times.items() if name.startswith("Embree")]
+        gain = ratios(min(peers, key=median), ours)
+        rows.append(
+            (
+                mesh,
+                group["set"],
+                group["rays"],
+                *map(cell, names),
+                f"{median(gain):.2f} ({min(gain):.2f} to {max(gain):.2f})",
+                efficiency(times, DEFAULT_MODE, threads),
+                group["differ"],
+            )
+        )
+    ends = [f"{DEFAULT_MODE} to the better of Embree's", "efficiency", "other face than Embree"]
+    return table(" | ".join(["mesh", "rays", "number", *names, *ends]), rows)
+
+
+def preview_rows(meshes: list[tuple[str, dict[str, Any]]]) -> Iterable[Sequence[object]]:
+    """One row per mesh and builder"""
+    for mesh, measured in meshes:
+        group = measured["preview"]
+        times = times_of(group)
+        medium = times["Embree MEDIUM", group["threads"]]
+        for (name, threads), ms in times.items():
+            yield mesh, threads, name, spread(ms), len(ms), f"{median(ratios(medium, ms)):.2f}", group["differ"]
 
 
 def header(report: dict[str, Any]) -> str:
@@ -141,6 +197,19 @@ def markdown(report: dict[str, Any]) -> str:
         head = "mesh | threads | builder | ms | turns | Mtri/s | times as fast as MEDIUM | efficiency"
         parts += [f"## Builds, {simd}", table(head, build_rows(meshes))]
         parts += [f"### Phases, {simd}, median ms", phase_table(meshes)]
+    for simd, meshes in per_simd(report, "rays").items():
+        threads = meshes[0][1]["threads"]
+        parts += [
+            f"## Rays, {simd}, {threads} threads, millions per second",
+            "In brackets: wide nodes and blocks of eight triangles that a ray visits. Embree is MEDIUM and ROBUST.",
+            ray_table(meshes),
+        ]
+    for simd, meshes in per_simd(report, "preview").items():
+        head = "mesh | threads | builder | ms | turns | times as fast as MEDIUM | pixels that differ"
+        parts += [
+            f"## From triangles to a picture of 1024 x 1024 with shadows, {simd}",
+            table(head, preview_rows(meshes)),
+        ]
     for meshes in per_simd(report, "quality").values():
         head = (
             "mesh | mode | SAH cost, step 15 and block 12 | over exact | SAH cost, step 15 and triangle 20 | "

@@ -81,11 +81,11 @@ def test_mesh_is_written_again_when_its_source_is_newer(tmp_path: Path, monkeypa
     assert np.fromfile(path, np.uint64, 2).tolist() == [4, 3]
 
 
-def builds(threads: int, **ms: list[float]) -> dict[str, Any]:
+def group_of(threads: int, **ms: list[float]) -> dict[str, Any]:
     rows: list[dict[str, Any]] = []
     for name, values in ms.items():
         builder, _, count = name.partition("_on_")
-        rows.append({"builder": builder.replace("_", " "), "threads": int(count or threads), "ms": values})
+        rows.append({"name": builder.replace("_", " "), "threads": int(count or threads), "ms": values})
     return {"threads": threads, "rows": rows}
 
 
@@ -113,7 +113,7 @@ def report_of(**measured: Any) -> dict[str, Any]:
 
 def test_build_table_pairs_the_turns() -> None:
     """The machine is slow in the second turn: the times show it, ratio and efficiency do not"""
-    group = builds(
+    group = group_of(
         2,
         balanced_on_1=[16, 48, 16],
         balanced=[10, 30, 10],
@@ -125,12 +125,12 @@ def test_build_table_pairs_the_turns() -> None:
     row = cells(text, "bunny", "2", "balanced")
     assert row[3:] == ["10.00 (10.00 to 30.00)", "3", "5.00", "2.50", "0.80"]
     assert cells(text, "bunny", "2", "Embree HIGH")[4:] == ["1", "0.50", "0.25", ""]
-    uneven = builds(2, balanced=[10, 40], Embree_MEDIUM=[20, 80], balanced_on_1=[20, 80])
+    uneven = group_of(2, balanced=[10, 40], Embree_MEDIUM=[20, 80], balanced_on_1=[20, 80])
     assert cells(markdown(report_of(builds=[uneven])), "bunny", "2", "balanced")[6:] == ["2.00", "1.00"]
 
 
 def test_phases_are_medians_per_mode() -> None:
-    group = builds(1, balanced=[10, 12, 11], Embree_MEDIUM=[25, 25, 25])
+    group = group_of(1, balanced=[10, 12, 11], Embree_MEDIUM=[25, 25, 25])
     group["rows"][0]["phases_ms"] = {"bounds": [1, 3, 2], "layout": [9, 9, 9]}
     text = markdown(report_of(builds=[group]))
     assert "| mesh | threads | mode | bounds | layout |" in text
@@ -157,8 +157,8 @@ def test_quality_is_stated_over_exact_where_that_was_built() -> None:
 
 def test_memory_is_compared_with_medium() -> None:
     rows = [
-        {"builder": "balanced", "threads": 2, "peak_mb": 9.0, "kept_mb": 5.0},
-        {"builder": "Embree MEDIUM", "threads": 2, "peak_mb": 6.0, "kept_mb": 4.0},
+        {"name": "balanced", "threads": 2, "peak_mb": 9.0, "kept_mb": 5.0},
+        {"name": "Embree MEDIUM", "threads": 2, "peak_mb": 6.0, "kept_mb": 4.0},
     ]
     row = cells(markdown(report_of(memory=rows)), "bunny", "balanced")
     assert row[2:] == ["9.0", "5.0", "105", "1.50", "1.25"]
@@ -168,3 +168,33 @@ def test_busy_machine_is_said_so() -> None:
     report = report_of(quality={"draft": quality(550)})
     assert "busy" not in markdown(report)
     assert "busy" in markdown({**report, "machine": {**MACHINE, "quiet": False}})
+
+
+def test_rays_are_compared_with_the_faster_of_embrees_calls() -> None:
+    group = group_of(2, balanced=[10, 20], balanced_on_1=[19, 38], Embree_single=[30, 60], Embree_packets_of_8=[15, 15])
+    group.update(set="primary", rays=20_000, differ=3)
+    group["rows"][0]["steps"] = {"nodes": 2.25, "blocks": 1.125}
+    text = markdown(report_of(rays=[group], threads=2))
+    row = cells(text, "bunny", "primary")
+    assert row[2:] == ["20000", "1.33 (2.2, 1.1)", "0.44", "1.33", "1.12 (0.75 to 1.50)", "0.95", "3"]
+    assert "| number | balanced | Embree single | Embree packets of 8 |" in text
+
+
+def test_call_that_a_set_was_not_traced_with_is_left_blank() -> None:
+    sets = [
+        {**group_of(1, balanced=[10], Embree_single=[20]), "set": "primary", "rays": 1000, "differ": 0},
+        {**group_of(1, balanced=[10], Embree_stream=[20]), "set": "random", "rays": 1000, "differ": 0},
+    ]
+    text = markdown(report_of(rays=sets, threads=1))
+    assert cells(text, "bunny", "primary")[4:6] == ["0.05", ""]
+    assert cells(text, "bunny", "random")[4:6] == ["", "0.05"]
+
+
+def test_picture_is_compared_with_medium() -> None:
+    group = {**group_of(2, balanced=[10, 30], Embree_MEDIUM=[20, 60]), "differ": 1}
+    assert cells(markdown(report_of(preview=group)), "bunny", "2", "balanced")[3:] == [
+        "20.00 (10.00 to 30.00)",
+        "2",
+        "2.00",
+        "1",
+    ]
