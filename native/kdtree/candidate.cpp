@@ -1,0 +1,67 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+#include "kdtree/candidate.h"
+
+#include <algorithm>
+#include <cmath>
+
+#include "geometry/exact_hit.h"
+
+namespace espalier {
+namespace {
+
+bool hit_place(const Ray& ray, const TriangleBlock* blocks, uint32_t place, ExactHit& hit) {
+    const TriangleBlock& block = blocks[place / kBlockSize];
+    const uint32_t lane = place % kBlockSize;
+    Vec3f corner[3];
+    for (int k = 0; k < 3; ++k) {
+        corner[k] = {block.vertex[k][0][lane], block.vertex[k][1][lane], block.vertex[k][2][lane]};
+    }
+    hit.triangle = static_cast<int32_t>(block.triangle[lane]);
+    return hit_exactly(ray.origin, ray.direction, corner, hit);
+}
+
+/// Infinite beyond the largest float, where the language leaves a cast open.
+float round_to_float(double t) {
+    constexpr double kLargest = std::numeric_limits<float>::max();
+    return t > kLargest    ? std::numeric_limits<float>::infinity()
+           : t < -kLargest ? -std::numeric_limits<float>::infinity()
+                           : static_cast<float>(t);
+}
+
+}  // namespace
+
+bool take_exactly(const Ray& ray, const TriangleBlock* blocks, uint32_t place, Nearest& nearest) {
+    ExactHit candidate;
+    if (!hit_place(ray, blocks, place, candidate) ||
+        compare_distance(ray.origin, ray.direction, candidate, ray.t_min) < 0 ||
+        compare_distance(ray.origin, ray.direction, candidate, ray.t_max) > 0) {
+        return false;
+    }
+    if (nearest.place != kNoPlace) {
+        ExactHit other;
+        if (hit_place(ray, blocks, nearest.place, other)) {
+            const int order = compare_distance(ray.origin, ray.direction, candidate, other);
+            if (order > 0 || (order == 0 && candidate.triangle >= other.triangle)) {
+                return false;
+            }
+        }
+    }
+    const double scale = std::max({std::abs(ray.direction.x), std::abs(ray.direction.y), std::abs(ray.direction.z)});
+    const double lower = (candidate.t - candidate.error) * scale;
+    const double upper = (candidate.t + candidate.error) * scale;
+    nearest.place = place;
+    nearest.lower = round_to_float(lower - std::abs(lower) * 0x1p-22 - 0x1p-120);
+    nearest.upper = round_to_float(upper + std::abs(upper) * 0x1p-22 + 0x1p-120);
+    return true;
+}
+
+Hit finish_exactly(const Ray& ray, const TriangleBlock* blocks, uint32_t place) {
+    ExactHit hit;
+    if (!hit_place(ray, blocks, place, hit)) {
+        return missed(ray);
+    }
+    finish_distance(ray.origin, ray.direction, hit);
+    return {round_to_float(hit.t), static_cast<float>(hit.u), static_cast<float>(hit.v), hit.triangle};
+}
+
+}  // namespace espalier

@@ -1,0 +1,263 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+// Many rays in flight on one thread, each on its own way: while the memory that one needs is fetched, others step.
+// Compiled once per instruction set (see traversal.cpp).
+
+#if defined(ESPALIER_KDTREE_STREAM_INL_H_) == defined(HWY_TARGET_TOGGLE)
+#ifdef ESPALIER_KDTREE_STREAM_INL_H_
+#undef ESPALIER_KDTREE_STREAM_INL_H_
+#else
+#define ESPALIER_KDTREE_STREAM_INL_H_
+#endif
+
+#include <hwy/highway.h>
+
+#include <bit>
+#include <cstdint>
+#include <span>
+#include <utility>
+
+#include "kdtree/finish-inl.h"
+#include "kdtree/traced_ray-inl.h"
+#include "kdtree/triangle_test-inl.h"
+
+HWY_BEFORE_NAMESPACE();
+namespace espalier::HWY_NAMESPACE {
+namespace hn = hwy::HWY_NAMESPACE;
+
+/// A ray under way with what it still has to visit, the nearest on top, and at the bottom the mark that nothing is
+/// left. 70 levels of wide nodes cover the deepest kd-tree, 48 levels if each opens but its siblings, and below it the
+/// longest leaf, kMaxBlocks halved until parts of kMaxLeafBlocks are left.
+struct StreamRay : TracedRay {
+    static constexpr uint32_t kNothing = 0;  ///< the root, which is nobody's child
+    static constexpr size_t kCapacity = 70 * (WideNode::kWidth - 1) + 3 * WideNode::kWidth;
+
+    uint32_t number;  ///< among the rays
+    uint32_t next;    ///< where it goes: a child's code
+    uint32_t* top;
+    uint32_t children[kCapacity];
+    float depths[kCapacity];  ///< where the ray enters the child
+
+    HWY_INLINE float* top_depth() { return depths + (top - children); }
+
+    HWY_INLINE void clear_stack() {
+        children[0] = kNothing;
+        depths[0] = -kInfinity;
+        top = children + 1;
+    }
+
+    /// Drops what lies beyond the ray's reach.
+    HWY_INLINE void prune() {
+        const hn::CappedTag<float, WideNode::kWidth> d;
+        const hn::RebindToUnsigned<decltype(d)> du;
+        constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<float, WideNode::kWidth>());
+        const auto count = static_cast<size_t>(top - children);
+        const auto limit = hn::Set(d, reach);
+        size_t kept = 0;
+        for (size_t i = 0; i < count; i += kLanes) {
+            const auto entry = hn::LoadU(d, depths + i);
+            const auto child = hn::LoadU(du, children + i);
+            // The last vector runs over the end: what lies there counts for nothing.
+            const auto keep = hn::And(hn::Le(entry, limit), hn::FirstN(d, count - i));
+            hn::StoreU(hn::Compress(child, hn::RebindMask(du, keep)), du, children + kept);
+            hn::StoreU(hn::Compress(entry, keep), d, depths + kept);
+            kept += hn::CountTrue(d, keep);
+        }
+        top = children + kept;
+    }
+};
+
+/// Stacks the children that the ray meets, nearer ones later.
+HWY_INLINE void visit_node(StreamRay& ray, const WideNode& node) {
+    const hn::CappedTag<float, WideNode::kWidth> d;
+    [[maybe_unused]] const hn::RebindToUnsigned<decltype(d)> du;
+    constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<float, WideNode::kWidth>());
+    const float* planes = node.lower[0];
+    static_assert(sizeof(node.lower) == 3 * WideNode::kWidth * sizeof(float));
+    [[maybe_unused]] alignas(32) float entries[WideNode::kWidth];
+    [[maybe_unused]] uint32_t met = 0;
+    for (size_t first = 0; first < WideNode::kWidth; first += kLanes) {
+        auto entry = hn::Set(d, ray.start);
+        auto exit = hn::Set(d, ray.reach);
+        for (int axis = 0; axis < 3; ++axis) {
+            const auto near = hn::Load(d, planes + ray.near_planes[axis] + first);
+            const auto far = hn::Load(d, planes + ray.far_planes[axis] + first);
+            const auto inverse = hn::Set(d, ray.inverse[axis]);
+            entry = hn::Max(hn::MulAdd(near, inverse, hn::Set(d, ray.near_shift[axis])), entry);
+            exit = hn::Min(hn::MulAdd(far, inverse, hn::Set(d, ray.far_shift[axis])), exit);
+        }
+        const auto meets = hn::Le(entry, hn::Mul(exit, hn::Set(d, 1 + 0x1p-21F)));
+#if HWY_TARGET != HWY_SSE4 && HWY_TARGET != HWY_NEON
+        // All eight in one register: permute by the octant's order and compress onto the stack, without a branch on
+        // their number.
+        static_assert(kLanes == WideNode::kWidth);
+        const auto ranks = hn::Shr(hn::Set(du, node.order[ray.octant]), hn::Mul(hn::Iota(du, 0), hn::Set(du, 3)));
+        const auto order = hn::IndicesFromVec(d, hn::And(ranks, hn::Set(du, 7)));
+        const auto child = hn::BitCast(du, hn::TableLookupLanes(hn::BitCast(d, hn::Load(du, node.child)), order));
+        const auto depth = hn::TableLookupLanes(hn::IfThenElse(meets, entry, hn::Inf(d)), order);
+        const auto stacked = hn::Lt(depth, hn::Inf(d));
+        uint32_t* top = ray.top;
+        hn::StoreU(hn::Compress(child, hn::RebindMask(du, stacked)), du, top);
+        hn::StoreU(hn::Compress(depth, stacked), d, ray.top_depth());
+        ray.top = top + hn::CountTrue(d, stacked);
+    }
+#else
+        hn::Store(entry, d, entries + first);
+        uint8_t bits[8] = {};
+        hn::StoreMaskBits(d, meets, bits);
+        met |= static_cast<uint32_t>(bits[0]) << first;
+    }
+    uint32_t order = node.order[ray.octant];
+    for (int i = 0; i < WideNode::kWidth; ++i, order >>= 3) {
+        const uint32_t slot = order & 7U;
+        *ray.top = node.child[slot];
+        *ray.top_depth() = entries[slot];
+        ray.top += met >> slot & 1U;
+    }
+#endif
+}
+
+/// Traces rays through a tree. For any hit a ray ends at the first.
+template <bool kAnyHit, bool kExact>
+class Stream {
+ public:
+    Stream(const Tree& tree, std::span<const Ray> rays)
+        : nodes_(tree.wide_nodes.data()), blocks_(tree.blocks.data()), extent_(extent_of(tree)), rays_(rays) {}
+
+    /// Calls done(ray) for each ray when its way has ended.
+    template <class Done>
+    HWY_INLINE void run(const Done& done) {
+        uint32_t begun = 0;
+        const auto count = static_cast<uint32_t>(rays_.size());
+        for (uint32_t slot = 0; slot < kInFlight && begun < count; ++slot) {
+            begin(ray_[slot], begun++);
+        }
+        while ((at_node_ | at_leaf_ | at_end_) != 0) {
+            // Each list is read from its front while rays are put behind; as each ray is put back once at most, a list
+            // may be refilled while it is read.
+            const uint32_t nodes = std::exchange(at_node_, 0);
+            for (uint32_t i = 0; i < nodes; ++i) {
+                StreamRay& ray = *node_list_[i];
+                visit_node(ray, nodes_[ray.next]);
+                go_on(ray, *--ray.top);
+            }
+            const uint32_t leaves = std::exchange(at_leaf_, 0);
+            for (uint32_t i = 0; i < leaves; ++i) {
+                StreamRay& ray = *leaf_list_[i];
+                const uint32_t leaf = ray.next;
+                const uint32_t further = leaf % WideNode::kMaxLeafBlocks;  // blocks behind the first
+                const uint32_t block = WideNode::first_block(leaf);
+                Verdict verdict;
+                const uint32_t possible = test_blocks<kExact>(ray, blocks_ + block, further == 0, verdict);
+                if (possible != 0 && take(ray, verdict, possible, block)) {
+                    if constexpr (kAnyHit) {
+                        end_list_[at_end_++] = &ray;
+                        continue;
+                    } else {
+                        ray.prune();
+                    }
+                }
+                // The rest of the leaf is some blocks further, and as many less.
+                const bool is_last = further < kBlocksPerStep;
+                const uint32_t rest = leaf + (WideNode::kMaxLeafBlocks - 1) * kBlocksPerStep;
+                const uint32_t top = ray.top[-1];
+                ray.top -= is_last ? 1 : 0;
+                go_on(ray, is_last ? top : rest);
+            }
+            const uint32_t ended = std::exchange(at_end_, 0);
+            for (uint32_t i = 0; i < ended; ++i) {
+                done(*end_list_[i]);
+                if (begun < count) {
+                    begin(*end_list_[i], begun++);
+                }
+            }
+        }
+    }
+
+ private:
+    static constexpr uint32_t kInFlight = 32;
+
+    HWY_INLINE void begin(StreamRay& ray, uint32_t number) {
+        ray.start_from(rays_[number], extent_);
+        ray.number = number;
+        ray.next = 0;
+        ray.clear_stack();
+        node_list_[at_node_++] = &ray;
+    }
+
+    /// Puts a ray on the list of what it does next, and has the memory for that fetched, without a branch on which.
+    HWY_INLINE void go_on(StreamRay& ray, uint32_t child) {
+        ray.next = child;
+        const bool is_end = child == StreamRay::kNothing;
+        const uint32_t is_leaf = child >> 31;
+        leaf_list_[at_leaf_] = &ray;
+        node_list_[at_node_] = &ray;
+        end_list_[at_end_] = &ray;
+        at_leaf_ += is_leaf;
+        at_node_ += (1 - is_leaf) & (is_end ? 0 : 1);
+        at_end_ += is_end ? 1 : 0;
+        const auto node = reinterpret_cast<uintptr_t>(nodes_ + child);
+        const auto block = reinterpret_cast<uintptr_t>(blocks_ + WideNode::first_block(child));
+        const auto* wanted = reinterpret_cast<const char*>(node ^ ((node ^ block) & (uintptr_t{0} - is_leaf)));
+        for (int line = 0; line < 5; ++line) {
+            __builtin_prefetch(wanted + 64 * line);
+        }
+    }
+
+    /// Takes in what a block's test has found. Returns whether there is a new nearest hit.
+    HWY_INLINE bool take(StreamRay& ray, const Verdict& verdict, uint32_t possible, uint32_t block) {
+        bool taken = false;
+        for (uint32_t lanes = possible; lanes != 0; lanes &= lanes - 1) {
+            const auto lane = static_cast<uint32_t>(std::countr_zero(lanes));
+            taken |= take_lane(ray, verdict.lower[lane], verdict.upper[lane], (verdict.certain >> lane & 1U) != 0,
+                               block * kBlockSize + lane);
+            if (kAnyHit && taken) {
+                return true;
+            }
+        }
+        return taken;
+    }
+
+    HWY_INLINE bool take_lane(StreamRay& ray, float lower, float upper, bool certain, uint32_t place) {
+        if (!kExact || (certain && lower >= ray.sure_start && upper <= ray.sure_end && upper < ray.lower)) {
+            if (!kExact && upper >= ray.upper) {
+                return false;
+            }
+            ray.place = place;
+            ray.shorten(lower, upper);
+            return true;
+        }
+        if (lower > ray.reach) {
+            return false;
+        }
+        return take_open(ray, place);
+    }
+
+    HWY_NOINLINE bool take_open(StreamRay& ray, uint32_t place) {
+        if (ray.place != kNoPlace && triangle_at(blocks_, ray.place) == triangle_at(blocks_, place)) {
+            return false;
+        }
+        Nearest nearest{ray.place, ray.lower, ray.upper};
+        if (!take_exactly(rays_[ray.number], blocks_, place, nearest)) {
+            return false;
+        }
+        ray.place = place;
+        ray.shorten(nearest.lower, nearest.upper);
+        return true;
+    }
+
+    const WideNode* nodes_;
+    const TriangleBlock* blocks_;
+    float extent_;
+    std::span<const Ray> rays_;
+    uint32_t at_node_ = 0;
+    uint32_t at_leaf_ = 0;
+    uint32_t at_end_ = 0;
+    StreamRay* node_list_[kInFlight + 1];
+    StreamRay* leaf_list_[kInFlight + 1];
+    StreamRay* end_list_[kInFlight + 1];
+    StreamRay ray_[kInFlight];
+};
+
+}  // namespace espalier::HWY_NAMESPACE
+HWY_AFTER_NAMESPACE();
+#endif
