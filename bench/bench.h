@@ -2,9 +2,12 @@
 // What the measuring programs share: meshes, the modes that are measured, and contestants that take turns.
 #pragma once
 
+#include <malloc.h>
+
 #include <algorithm>
 #include <array>
 #include <chrono>
+#include <cmath>
 #include <fstream>
 #include <functional>
 #include <nlohmann/json.hpp>
@@ -63,11 +66,43 @@ inline Mesh read_mesh(const std::string& path) {
     return mesh;
 }
 
+/// So many copies of a mesh, side by side on a square.
+inline Mesh copies_of(const Mesh& mesh, int copies) {
+    Box3f bounds;
+    const size_t vertices = mesh.positions.size() / 3;
+    for (size_t i = 0; i < vertices; ++i) {
+        bounds.extend(Vec3f{mesh.positions[3 * i], mesh.positions[3 * i + 1], mesh.positions[3 * i + 2]});
+    }
+    const auto across = static_cast<int>(std::ceil(std::sqrt(copies)));
+    Mesh all{{}, {}, mesh.view};
+    all.positions.reserve(3 * vertices * static_cast<size_t>(copies) + 1);
+    all.triangles.reserve(mesh.triangles.size() * static_cast<size_t>(copies));
+    for (int copy = 0; copy < copies; ++copy) {
+        const float shift[3] = {bounds.size().x * static_cast<float>(copy % across),
+                                bounds.size().y * static_cast<float>(copy / across), 0};
+        for (size_t i = 0; i < 3 * vertices; ++i) {
+            all.positions.push_back(mesh.positions[i] + shift[i % 3]);
+        }
+        for (const uint32_t index : mesh.triangles) {
+            all.triangles.push_back(index + static_cast<uint32_t>(vertices) * static_cast<uint32_t>(copy));
+        }
+    }
+    all.positions.push_back(0);
+    return all;
+}
+
 /// The first triangles of a mesh: enough to load code and wake threads before a clock runs.
 inline Mesh sample_of(const Mesh& mesh) {
     Mesh sample = mesh;
     sample.triangles.resize(std::min<size_t>(mesh.triangles.size(), 3000));
     return sample;
+}
+
+/// Large blocks come from the system every time, as in a program's first build; by default glibc would begin to keep
+/// those that were freed.
+inline void use_fresh_memory() {
+    mallopt(M_MMAP_THRESHOLD, 128 * 1024);
+    mallopt(M_TRIM_THRESHOLD, 128 * 1024);
 }
 
 class Stopwatch {

@@ -146,27 +146,52 @@ Json memory_in_child(const std::string& name, int threads, const WarmUp& warm_up
     return {{"name", name}, {"threads", threads}, {"peak_mb", mb[0]}, {"kept_mb", mb[1]}};
 }
 
+Json memory_of_ours(const Mesh& mesh, const Mode& mode, int threads) {
+    const BuildOptions options{.quality = mode.quality, .threads = threads};
+    return memory_in_child(
+        mode.name, threads, [&] { build(sample_of(mesh).soup(), options); },
+        [&] { return build(mesh.soup(), options); });
+}
+
+Json memory_of_embree(const Mesh& mesh, const EmbreeBuilder& builder, int threads) {
+    Device device;
+    const auto warm_up = [&] {
+        device = new_device(threads);
+        build_embree(device, sample_of(mesh).soup(), builder);
+    };
+    return memory_in_child(builder.name, threads, warm_up, [&] { return build_embree(device, mesh.soup(), builder); });
+}
+
 }  // namespace
 
 Json compare_memory(const Mesh& mesh, int threads) {
-    const Mesh sample = sample_of(mesh);
     Json rows;
     for (const Mode& mode : kModes) {
-        const auto build_it = [&](const Mesh& which) {
-            return build(which.soup(), {.quality = mode.quality, .threads = threads});
-        };
-        rows.push_back(memory_in_child(mode.name, threads, [&] { build_it(sample); }, [&] { return build_it(mesh); }));
+        rows.push_back(memory_of_ours(mesh, mode, threads));
     }
     for (const EmbreeBuilder& builder : kEmbreeBuilders) {
-        Device device;
-        const auto warm_up = [&] {
-            device = new_device(threads);
-            build_embree(device, sample.soup(), builder);
-        };
-        rows.push_back(memory_in_child(builder.name, threads, warm_up,
-                                       [&] { return build_embree(device, mesh.soup(), builder); }));
+        rows.push_back(memory_of_embree(mesh, builder, threads));
     }
     return rows;
+}
+
+Json compare_large(const Mesh& mesh, int threads, double seconds) {
+    constexpr int kCopies = 10;
+    const Mesh copies = copies_of(mesh, kCopies);
+    const Mode& mode = kModes[kDefaultMode];
+    const Json memory{memory_of_ours(copies, mode, threads), memory_of_embree(copies, kMedium, threads)};
+
+    const Device device = new_device(threads);
+    warm_up(mesh, device, threads);
+    std::vector<OurBuilds> ours{{mesh.soup(), mode, threads}, {copies.soup(), mode, threads}};
+    std::vector<Contestant> contestants;
+    contestants.emplace_back(mode.name, threads, [&] { return ours[0].run(); });
+    contestants.emplace_back(std::string(mode.name) + ", ten copies", threads, [&] { return ours[1].run(); });
+    contestants.emplace_back(kMedium.name, threads, [&] { return time_embree(device, mesh.soup(), kMedium); });
+    contestants.emplace_back(std::string(kMedium.name) + ", ten copies", threads,
+                             [&] { return time_embree(device, copies.soup(), kMedium); });
+    take_turns(contestants, seconds);
+    return {{"triangles", copies.soup().size()}, {"memory", memory}, {"rows", rows_of(contestants)}};
 }
 
 Json compare_builds(const Mesh& mesh, int threads, double seconds) {

@@ -1,10 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 // espalier_bench MESH SECONDS PART...: one mesh beside Embree, as JSON on standard output. MESH is a file that run.py
-// wrote; SECONDS go to each group of contestants; parts are memory, quality, builds, rays and preview. The instruction
-// set of both sides is what ESPALIER_SIMD says. Without arguments: the instruction sets that this machine runs.
+// wrote; SECONDS go to each group of contestants; parts are memory, large, quality, builds, rays and preview. The
+// instruction set of both sides is what ESPALIER_SIMD says. Without arguments: the instruction sets that this machine
+// runs.
 #include "compare.h"
-
-#include <malloc.h>
 
 #include <cstdio>
 #include <exception>
@@ -17,10 +16,7 @@ namespace espalier::bench {
 namespace {
 
 Json compare(const std::string& path, double seconds, const std::set<std::string>& parts) {
-    // Large blocks come fresh from the system every time, as in a program's first build; by default glibc would begin
-    // to keep those that were freed.
-    mallopt(M_MMAP_THRESHOLD, 128 * 1024);
-    mallopt(M_TRIM_THRESHOLD, 128 * 1024);
+    use_fresh_memory();
     const FlushToZero as_embree_asks;  // our side sets and restores its own
 
     const Mesh mesh = read_mesh(path);
@@ -32,6 +28,9 @@ Json compare(const std::string& path, double seconds, const std::set<std::string
                 {"embree", RTC_VERSION_STRING}};
     if (parts.contains("memory")) {
         result["memory"] = compare_memory(mesh, all);
+    }
+    if (parts.contains("large")) {
+        result["large"] = compare_large(mesh, all, seconds);
     }
     if (parts.contains("quality")) {
         result["quality"] = compare_quality(mesh);

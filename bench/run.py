@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Measures builds and rays beside Embree on the meshes that are there: python -m bench.run [--help]
 
-Writes build/bench/bench.json and build/bench/bench.md, and prints the latter.
+Writes build/bench/bench.json and bench.md, or large or scaling in place of bench, and prints the latter.
+build/bench/espalier_scaling and a .mesh file from there are all that another machine needs: it prints the JSON whose
+place is report["meshes"][name][simd].
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ MESHES = ("sponza", "bunny", "armadillo", "dragon")  # .npz files
 SCENES = ("sculpture",)  # shipped ones, exported as the world's triangles
 INTERIORS = {"sponza"}  # looked at from within
 PARTS = ("memory", "quality", "builds", "rays", "preview")
+ONCE = {"memory", "quality"}  # parts that are the same for every instruction set
 QUIET_LOAD = 0.3
 
 Points = NDArray[np.float32]
@@ -137,13 +140,13 @@ def run(*arguments: str | Path, simd: str = "") -> Any:
 
 
 def compare(options: argparse.Namespace) -> dict[str, Any]:
-    """Every mesh with every instruction set; memory and quality, which do not depend on that, with the first alone"""
+    """Every mesh with every instruction set; what does not depend on that, with the first alone"""
     start = time.monotonic()
     report: dict[str, Any] = {"machine": machine(), "meshes": {}}
     if not report["machine"]["quiet"]:
         print(f"This machine is busy (load {report['machine']['load']:.2f}): do not quote these times", file=sys.stderr)
-    program = BUILD / "espalier_bench"
-    simds = options.simd.split(",") if options.simd else run(program)
+    program = BUILD / ("espalier_scaling" if options.scaling else "espalier_bench")
+    simds = options.simd.split(",") if options.simd else run(BUILD / "espalier_bench")
     for name in options.meshes.split(","):
         path = prepare(name)
         if path is None:
@@ -151,26 +154,33 @@ def compare(options: argparse.Namespace) -> dict[str, Any]:
         report["meshes"][name] = {}
         for simd in simds:
             print(f"{time.monotonic() - start:4.0f} s  {name}, {simd}", file=sys.stderr)
-            parts = [part for part in options.parts.split(",") if simd == simds[0] or part not in {"memory", "quality"}]
+            parts = [part for part in options.parts.split(",") if simd == simds[0] or part not in ONCE]
             seconds = "1" if options.quick else "3"
-            if parts:
-                report["meshes"][name][simd] = run(program, path, seconds, *parts, simd=simd)
+            if options.scaling or parts:
+                arguments = () if options.scaling else parts
+                report["meshes"][name][simd] = run(program, path, seconds, *arguments, simd=simd)
     return report
 
 
 def main() -> None:
     """See the module's text"""
     parser = argparse.ArgumentParser(description="Measure builds and rays beside Embree.")
+    everything = ",".join(MESHES + SCENES)
     parser.add_argument("--quick", action="store_true", help="a third of the time, on sponza and bunny by default")
-    parser.add_argument("--meshes", help=f"some of {','.join(MESHES + SCENES)}, which is the default")
+    parser.add_argument("--meshes", help=f"some of {everything}, which is the default")
     parser.add_argument("--simd", help="some of avx512,avx2,sse4,neon; by default all that the machine has")
     parser.add_argument("--parts", default=",".join(PARTS), help="some of %(default)s, which is the default")
+    parser.add_argument("--large", action="store_true", help="instead: builds of ten copies, by default of sculpture")
+    parser.add_argument("--scaling", action="store_true", help="instead: 1, 2, 4 ... threads, without Embree")
     options = parser.parse_args()
-    options.meshes = options.meshes or ("sponza,bunny" if options.quick else ",".join(MESHES + SCENES))
+    if options.large:
+        options.parts, options.meshes = "large", options.meshes or "sculpture"
+    options.meshes = options.meshes or ("sponza,bunny" if options.quick else everything)
     BUILD.mkdir(parents=True, exist_ok=True)
     report = compare(options)
-    (BUILD / "bench.json").write_text(json.dumps(report), encoding="utf-8")
-    (BUILD / "bench.md").write_text(markdown(report), encoding="utf-8")
+    name = "large" if options.large else "scaling" if options.scaling else "bench"
+    (BUILD / f"{name}.json").write_text(json.dumps(report), encoding="utf-8")
+    (BUILD / f"{name}.md").write_text(markdown(report), encoding="utf-8")
     print(markdown(report))
 
 

@@ -198,3 +198,24 @@ def test_picture_is_compared_with_medium() -> None:
         "2.00",
         "1",
     ]
+
+
+def test_growth_and_memory_of_ten_copies() -> None:
+    group = group_of(2, balanced=[10, 20], Embree_MEDIUM=[20, 20])
+    copies = group_of(2, balanced=[105, 210], Embree_MEDIUM=[230, 230])["rows"]
+    group["rows"] += [{**row, "name": f"{row['name']}, ten copies"} for row in copies]
+    group["triangles"] = 500_000
+    group["memory"] = [
+        {"name": "balanced", "peak_mb": 90.0, "kept_mb": 50.0},
+        {"name": "Embree MEDIUM", "peak_mb": 60.0, "kept_mb": 40.0},
+    ]
+    text = markdown(report_of(large=group, threads=2))
+    ours = cells(text, "bunny", "500000", "2", "balanced")
+    assert ours[5:] == ["157.50 (105.00 to 210.00)", "2", "3.17", "10.50", "90", "50"]
+    assert cells(text, "bunny", "500000", "2", "Embree MEDIUM")[8] == "11.50"
+
+
+def test_scaling_over_one_thread() -> None:
+    rows = [{"name": "balanced", "threads": n, "ms": ms} for n, ms in [(1, [8, 16]), (2, [5, 10]), (4, [4, 4])]]
+    text = markdown(report_of(scaling=[{"what": "build, balanced", "rows": rows}]))
+    assert cells(text, "bunny", "build, balanced")[3:] == ["1.60 (0.80)", "3.00 (0.75)"]
