@@ -78,8 +78,9 @@ inline Mesh copies_of(const Mesh& mesh, int copies) {
     all.positions.reserve(3 * vertices * static_cast<size_t>(copies) + 1);
     all.triangles.reserve(mesh.triangles.size() * static_cast<size_t>(copies));
     for (int copy = 0; copy < copies; ++copy) {
-        const float shift[3] = {bounds.size().x * static_cast<float>(copy % across),
-                                bounds.size().y * static_cast<float>(copy / across), 0};
+        const int row = copy / across;
+        const float shift[3] = {bounds.size().x * static_cast<float>(copy - row * across),
+                                bounds.size().y * static_cast<float>(row), 0};
         for (size_t i = 0; i < 3 * vertices; ++i) {
             all.positions.push_back(mesh.positions[i] + shift[i % 3]);
         }
