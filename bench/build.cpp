@@ -175,9 +175,8 @@ Json compare_memory(const Mesh& mesh, int threads) {
     return rows;
 }
 
-Json compare_large(const Mesh& mesh, int threads, double seconds) {
-    constexpr int kCopies = 10;
-    const Mesh copies = copies_of(mesh, kCopies);
+Json compare_large(const Mesh& mesh, int copy_count, int threads, double seconds) {
+    const Mesh copies = copies_of(mesh, copy_count);
     const Mode& mode = kModes[kDefaultMode];
     const Json memory{memory_of_ours(copies, mode, threads), memory_of_embree(copies, kMedium, threads)};
 
@@ -186,12 +185,15 @@ Json compare_large(const Mesh& mesh, int threads, double seconds) {
     std::vector<OurBuilds> ours{{mesh.soup(), mode, threads}, {copies.soup(), mode, threads}};
     std::vector<Contestant> contestants;
     contestants.emplace_back(mode.name, threads, [&] { return ours[0].run(); });
-    contestants.emplace_back(std::string(mode.name) + ", ten copies", threads, [&] { return ours[1].run(); });
+    contestants.emplace_back(std::string(mode.name) + ", copies", threads, [&] { return ours[1].run(); });
     contestants.emplace_back(kMedium.name, threads, [&] { return time_embree(device, mesh.soup(), kMedium); });
-    contestants.emplace_back(std::string(kMedium.name) + ", ten copies", threads,
+    contestants.emplace_back(std::string(kMedium.name) + ", copies", threads,
                              [&] { return time_embree(device, copies.soup(), kMedium); });
     take_turns(contestants, seconds);
-    return {{"triangles", copies.soup().size()}, {"memory", memory}, {"rows", rows_of(contestants)}};
+    return {{"copies", copy_count},
+            {"triangles", copies.soup().size()},
+            {"memory", memory},
+            {"rows", rows_of(contestants)}};
 }
 
 Json compare_builds(const Mesh& mesh, int threads, double seconds) {

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 // espalier_bench MESH SECONDS PART...: one mesh beside Embree, as JSON on standard output. MESH is a file that run.py
-// wrote; SECONDS go to each group of contestants; parts are memory, large, quality, builds, rays and preview. The
+// wrote; SECONDS go to each group of contestants; parts are memory, copies=N, quality, builds, rays and preview. The
 // instruction set of both sides is what ESPALIER_SIMD says. Without arguments: the instruction sets that this machine
 // runs.
 #include "compare.h"
@@ -29,8 +29,10 @@ Json compare(const std::string& path, double seconds, const std::set<std::string
     if (parts.contains("memory")) {
         result["memory"] = compare_memory(mesh, all);
     }
-    if (parts.contains("large")) {
-        result["large"] = compare_large(mesh, all, seconds);
+    for (const std::string& part : parts) {
+        if (part.starts_with("copies=")) {
+            result["large"] = compare_large(mesh, std::stoi(part.substr(part.find('=') + 1)), all, seconds);
+        }
     }
     if (parts.contains("quality")) {
         result["quality"] = compare_quality(mesh);

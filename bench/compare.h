@@ -9,9 +9,9 @@ namespace espalier::bench {
 /// Resident megabytes over the input per builder, each in a child process. Call it before any thread is started.
 Json compare_memory(const Mesh& mesh, int threads);
 
-/// Builds of the mesh and of ten copies of it, in turns, with the memory that the copies take. Call it before any
+/// Builds of the mesh and of so many copies of it, in turns, with the memory that the copies take. Call it before any
 /// thread is started.
-Json compare_large(const Mesh& mesh, int threads, double seconds);
+Json compare_large(const Mesh& mesh, int copies, int threads, double seconds);
 
 /// Milliseconds per builder, ours also with the serial builder, in turns for about so many seconds.
 Json compare_builds(const Mesh& mesh, int threads, double seconds);

@@ -170,11 +170,18 @@ def main() -> None:
     parser.add_argument("--meshes", help=f"some of {everything}, which is the default")
     parser.add_argument("--simd", help="some of avx512,avx2,sse4,neon; by default all that the machine has")
     parser.add_argument("--parts", default=",".join(PARTS), help="some of %(default)s, which is the default")
-    parser.add_argument("--large", action="store_true", help="instead: builds of ten copies, by default of sculpture")
+    parser.add_argument(
+        "--large",
+        type=int,
+        nargs="?",
+        const=10,
+        metavar="COPIES",
+        help="instead: builds of %(const)s copies, by default of sculpture",
+    )
     parser.add_argument("--scaling", action="store_true", help="instead: 1, 2, 4 ... threads, without Embree")
     options = parser.parse_args()
     if options.large:
-        options.parts, options.meshes = "large", options.meshes or "sculpture"
+        options.parts, options.meshes = f"copies={options.large}", options.meshes or "sculpture"
     options.meshes = options.meshes or ("sponza,bunny" if options.quick else everything)
     BUILD.mkdir(parents=True, exist_ok=True)
     report = compare(options)
