@@ -155,7 +155,7 @@ def compare(options: argparse.Namespace) -> dict[str, Any]:
         for simd in simds:
             print(f"{time.monotonic() - start:4.0f} s  {name}, {simd}", file=sys.stderr)
             parts = [part for part in options.parts.split(",") if simd == simds[0] or part not in ONCE]
-            seconds = "1" if options.quick else "3"
+            seconds = "12" if options.large else "1" if options.quick else "3"
             if options.scaling or parts:
                 arguments = () if options.scaling else parts
                 report["meshes"][name][simd] = run(program, path, seconds, *arguments, simd=simd)
