@@ -347,6 +347,28 @@ def test_back_faces_are_lit_like_front_faces() -> None:
         np.testing.assert_allclose(draw(scene([what]), FROM_ABOVE, [sun])[..., 0], 3 / np.pi, rtol=1e-6)
 
 
+def test_hits_are_told_where_they_are_and_whose() -> None:
+    """A tilted quad with normals at its corners, placed twice, and a ray that misses both."""
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    normals = np.array([[-1, 0, 1], [1, 0, 1], [1, 0, 1], [-1, 0, 1]])
+    what = scene([mesh(corners, QUAD, normals)], [placed(moved(1e5, 0, 0)), placed(moved(1e5, 0, -3))])
+    world = what.arrays()
+    tree = espalier_native.build(world["vertices"], world["triangles"])
+    origins = np.array([[0.5, 0.25, 9], [0.5, 0.25, -9], [8, 8, 9]], np.float32)
+    directions = np.array([[0, 0, -1], [0, 0, 1], [0, 0, -1]], np.float32)
+    hits = tree.intersect(origins, directions)
+    found = what.surface(hits["triangle"], hits["u"], hits["v"], directions)
+    assert found["placement"].tolist() == [0, 1, -1]
+    np.testing.assert_allclose(found["position"], [[0.5, 0.25, 1.5], [0.5, 0.25, -1.5], [0, 0, 0]], atol=1e-6)
+    np.testing.assert_allclose(found["geometric_normal"], [[0, 0, 1], [0, 0, -1], [0, 0, 0]], atol=1e-12)
+    leaning = np.array([0.5, 0, 1]) / np.hypot(0.5, 1)
+    np.testing.assert_allclose(found["shading_normal"], np.outer([1, -1, 0], leaning), atol=1e-6)
+    with pytest.raises(IndexError, match="triangle 4 is not in the scene"):
+        what.surface(np.array([4], np.int32), hits["u"][:1], hits["v"][:1], directions[:1])
+    with pytest.raises(ValueError, match="directions"):
+        what.surface(hits["triangle"], hits["u"], hits["v"], directions[:1])
+
+
 def test_each_face_has_the_colour_of_its_slot() -> None:
     colors = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
     two_faces = FLOOR | {"material_slots": np.array([0, 1], np.int32)}

@@ -3,6 +3,7 @@
 #include <limits>
 #include <memory>
 #include <span>
+#include <string>
 #include <vector>
 
 #include "module/arrays.h"
@@ -98,6 +99,35 @@ py::dict scene_arrays(const Scene& scene) {
                     "first_triangles"_a = py::array_t<uint32_t>(first.size(), first.data()));
 }
 
+/// The points of hits, as Tree.intersect() returned them for these directions.
+py::dict scene_surface(const Scene& scene, py::handle triangle, py::handle u, py::handle v, py::handle directions) {
+    const Array<int32_t> triangles = int_array(triangle, "triangle", {kAny});
+    const auto count = static_cast<py::ssize_t>(triangles.rows());
+    const Array<float> us = float_array(u, "u", {count}), vs = float_array(v, "v", {count});
+    const Array<float> along = float_array(directions, "directions", {count, 3});
+    py::array_t<int32_t> placement(count);
+    py::array_t<double> position({count, py::ssize_t{3}}), geometric({count, py::ssize_t{3}}),
+        shading({count, py::ssize_t{3}});
+    for (py::ssize_t i = 0; i < count; ++i) {
+        const int32_t hit = triangles.owner.at(i);
+        if (hit >= 0 && static_cast<uint64_t>(hit) >= scene.triangle_count())
+            throw py::index_error("triangle " + std::to_string(hit) + " is not in the scene");
+        SurfacePoint point{};
+        if (hit >= 0) {
+            const Vec3d direction{along.owner.at(i, 0), along.owner.at(i, 1), along.owner.at(i, 2)};
+            point = scene.surface(static_cast<uint32_t>(hit), us.owner.at(i), vs.owner.at(i), direction);
+        }
+        placement.mutable_at(i) = hit < 0 ? -1 : static_cast<int32_t>(scene.placement_of(static_cast<uint32_t>(hit)));
+        for (int axis = 0; axis < 3; ++axis) {
+            position.mutable_at(i, axis) = point.position[axis];
+            geometric.mutable_at(i, axis) = point.geometric_normal[axis];
+            shading.mutable_at(i, axis) = point.shading_normal[axis];
+        }
+    }
+    return py::dict("placement"_a = placement, "position"_a = position, "geometric_normal"_a = geometric,
+                    "shading_normal"_a = shading);
+}
+
 }  // namespace
 
 void bind_scene(py::module_& module) {
@@ -115,7 +145,8 @@ void bind_scene(py::module_& module) {
         .def_property_readonly("objects", &objects_list, docs::kObjects)
         .def_property_readonly(
             "precision", [](const Scene& scene) { return precision_dict(scene.precision()); }, docs::kPrecision)
-        .def("arrays", &scene_arrays, docs::kSceneArrays);
+        .def("arrays", &scene_arrays, docs::kSceneArrays)
+        .def("surface", &scene_surface, "triangle"_a, "u"_a, "v"_a, "directions"_a, docs::kSurface);
 }
 
 }  // namespace espalier

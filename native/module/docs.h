@@ -96,6 +96,14 @@ inline constexpr const char* kSceneArrays = R"(Copies of the world triangles, re
 vertices: float32 [N, 3]. triangles: uint32 [M, 3]. first_triangles: uint32, the first triangle of each
 placement, then M.)";
 
+inline constexpr const char* kSurface = R"(The points of the scene that rays hit.
+
+triangle: int32 [R], -1 at a miss, u and v: float32 [R], as Tree.intersect() returns them for a tree over
+arrays(). directions: float32 [R, 3], those of the rays.
+Returns placement int32 [R] (-1 at a miss), position float64 [R, 3] relative to the centre, and
+geometric_normal and shading_normal float64 [R, 3], of unit length, turned against the ray (0 at a miss).
+Raises TypeError, ValueError, or IndexError for a triangle that is not in the scene.)";
+
 inline constexpr const char* kStartPreview =
     "Starts building a scene's tree and drawing its picture, and returns the Job at once.\n\n"
     "Arguments, result and errors as of render().";

@@ -58,6 +58,13 @@ class Scene:
     @property
     def precision(self) -> dict[str, float]: ...
     def arrays(self) -> dict[str, NDArray[Any]]: ...
+    def surface(
+        self,
+        triangle: NDArray[np.int32],
+        u: NDArray[np.float32],
+        v: NDArray[np.float32],
+        directions: NDArray[np.float32],
+    ) -> dict[str, NDArray[Any]]: ...
 
 @final
 class Job:

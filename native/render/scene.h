@@ -68,6 +68,7 @@ class Scene {
     TriangleSoup soup() const { return {positions_, triangles_}; }
     /// The first triangle of each placement, then the number of all.
     std::span<const uint32_t> first_triangles() const { return first_triangle_; }
+    size_t placement_of(uint32_t triangle) const;
     uint64_t triangle_count() const { return triangles_.size() / 3; }
     Vec3d centre() const { return centre_; }
     double placing_ms() const { return placing_ms_; }
@@ -97,7 +98,6 @@ class Scene {
     void count_rejected(const std::vector<size_t>& object_of, int threads);
     void measure_precision(std::span<const MeshInput> meshes, std::span<const Placement> placements,
                            const std::vector<size_t>& object_of, int threads);
-    size_t placement_of(uint32_t triangle) const;
     Vec3d vertex(uint32_t index) const;
 
     std::vector<float> positions_;
