@@ -105,7 +105,7 @@ class Builder {
     /// One thread needs no top levels: all references in one piece, and one subtree.
     void make_references_alone() {
         const uint32_t triangles = soup_.size();
-        rooms_[0] = ReferenceBuffer(subtree_room(triangles));
+        rooms_[0] = ReferenceBuffer(subtree_room(triangles), expected_block_bytes(triangles));
         const uint32_t count = build_kernels().make_references(soup_, 0, triangles, rooms_[0].references(),
                                                                tree_.bounds, tree_.report.rejected_faces);
         whole_ = {tree_.bounds, tree_.bounds, count, spare_references(triangles), 0};
@@ -152,7 +152,8 @@ class Builder {
         });
     }
 
-    /// Phase 4: every node to its depth-first place.
+    /// Phase 4: every node to its depth-first place. The references are no longer needed; the triangle blocks get their
+    /// memory.
     void compact() {
         size_t nodes = 0;
         size_t triangles = 0;
@@ -171,13 +172,22 @@ class Builder {
         if (nodes > (1U << 30) || triangles / kBlockSize > kMaxBlocks) {
             throw std::length_error("the tree needs more nodes or blocks than its indices can count");
         }
+        LargeBuffer<uint32_t> references = top_ ? top_->take_memory() : rooms_[0].take_memory();
+        rooms_.clear();
+        tree_.blocks = std::move(references).reuse_for<TriangleBlock>(triangles / kBlockSize);
         tree_.nodes = LargeBuffer<KdNode>(nodes);
-        boxes_ = LargeBuffer<Box3f>(nodes);
-        triangles_ = LargeBuffer<uint32_t>(triangles);
-        parallel_for(threads_, subtrees_.size(), [&](size_t i) { copy_subtree(subtrees_[i]); });
-        if (top_) {
-            write_top(0, top_places);
+        if (!top_) {
+            std::copy_n(outputs_[0].nodes().begin(), nodes, tree_.nodes.data());
+            boxes_ = outputs_[0].boxes();
+            triangles_ = outputs_[0].triangles();
+            return;
         }
+        joined_boxes_ = LargeBuffer<Box3f>(nodes);
+        joined_triangles_ = LargeBuffer<uint32_t>(triangles);
+        parallel_for(threads_, subtrees_.size(), [&](size_t i) { copy_subtree(subtrees_[i]); });
+        write_top(0, top_places);
+        boxes_ = joined_boxes_.span();
+        triangles_ = joined_triangles_.span();
     }
 
     /// Gives every top node and subtree its place, in depth-first order.
@@ -207,9 +217,9 @@ class Builder {
                                : KdNode::inner(node.axis(), node.split(), node.right_child() + node_shift);
         }
         std::copy_n(output.boxes().begin() + static_cast<std::ptrdiff_t>(subtree.first_node), subtree.node_count,
-                    boxes_.data() + subtree.place);
+                    joined_boxes_.data() + subtree.place);
         std::copy_n(output.triangles().begin() + static_cast<std::ptrdiff_t>(subtree.first_triangle),
-                    subtree.triangle_count, triangles_.data() + size_t{subtree.block_place} * kBlockSize);
+                    subtree.triangle_count, joined_triangles_.data() + size_t{subtree.block_place} * kBlockSize);
     }
 
     void write_top(uint32_t index, const std::vector<uint32_t>& top_places) {
@@ -221,18 +231,17 @@ class Builder {
         write_top(top.right, top_places);
         const uint32_t right = top_places[top.right];
         tree_.nodes[top_places[index]] = KdNode::inner(top.split.axis, top.split.position, right);
-        Box3f box = boxes_[top_places[top.left]];
-        box.extend(boxes_[right]);
-        boxes_[top_places[index]] = box;
+        Box3f box = joined_boxes_[top_places[top.left]];
+        box.extend(joined_boxes_[right]);
+        joined_boxes_[top_places[index]] = box;
     }
 
     /// Given back while the clock runs: it is part of what a build costs.
     void release_working_memory() {
         top_.reset();
-        rooms_.clear();
         outputs_.clear();
-        boxes_ = {};
-        triangles_ = {};
+        joined_boxes_ = {};
+        joined_triangles_ = {};
     }
 
     const TriangleSoup& soup_;
@@ -245,8 +254,10 @@ class Builder {
     std::vector<Subtree*> subtree_of_;    ///< per top node; null where the node is split
     std::vector<SubtreeOutput> outputs_;  ///< per thread
     std::vector<ReferenceBuffer> rooms_;  ///< per thread
-    LargeBuffer<Box3f> boxes_;            ///< tight, per node
-    LargeBuffer<uint32_t> triangles_;     ///< per block
+    LargeBuffer<Box3f> joined_boxes_;         ///< of several subtrees
+    LargeBuffer<uint32_t> joined_triangles_;
+    std::span<const Box3f> boxes_;         ///< tight, per node
+    std::span<const uint32_t> triangles_;  ///< per block
     Tree tree_;
 };
 

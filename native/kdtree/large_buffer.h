@@ -57,6 +57,28 @@ class LargeBuffer {
         }
     }
 
+    /// The same memory for other items, whatever it holds; what they do not need is given back. Fresh memory if they
+    /// need more.
+    template <class U>
+    LargeBuffer<U> reuse_for(size_t capacity) && {
+        if (capacity == 0 || capacity * sizeof(U) > bytes()) {
+            return LargeBuffer<U>(capacity);
+        }
+        LargeBuffer<U> reused;
+        reused.data_ = reinterpret_cast<U*>(data_);
+        reused.capacity_ = capacity;
+        reused.mapping_ = std::exchange(mapping_, nullptr);
+        const auto begin = reinterpret_cast<uintptr_t>(reused.mapping_);
+        const auto end = (reinterpret_cast<uintptr_t>(reused.data_ + capacity) + kPage - 1) / kPage * kPage;
+        reused.mapped_ = end - begin;
+        if (reused.mapped_ < mapped_) {
+            ::munmap(reinterpret_cast<void*>(end), mapped_ - reused.mapped_);
+        }
+        data_ = nullptr;
+        capacity_ = mapped_ = 0;
+        return reused;
+    }
+
     T* data() { return data_; }
     const T* data() const { return data_; }
     size_t size() const { return capacity_; }
@@ -66,6 +88,9 @@ class LargeBuffer {
     std::span<const T> span() const { return {data_, capacity_}; }
 
  private:
+    template <class U>
+    friend class LargeBuffer;
+    static constexpr size_t kPage = size_t{64} << 10;  ///< the largest small page of any system
     static constexpr size_t kHugePage = size_t{2} << 20;
     static constexpr size_t kHugePagesFrom = size_t{384} << 10;  ///< clearing the rest of the page costs as much
     T* data_ = nullptr;

@@ -12,13 +12,30 @@
 namespace espalier {
 namespace {
 
+/// Wide nodes in the order in which they are made. Reserved for the worst case, taken page by page.
+class WideNodes {
+ public:
+    WideNodes() = default;
+    explicit WideNodes(size_t capacity) : nodes_(capacity) {}
+    uint32_t add() { return count_++; }
+    uint32_t count() const { return count_; }
+    WideNode* data() { return nodes_.data(); }
+    void clear() { count_ = 0; }
+
+ private:
+    LargeBuffer<WideNode> nodes_;
+    uint32_t count_ = 0;
+};
+
 /// A run of kd nodes that forms one subtree, laid out by one thread. Where the tree is cut into such runs depends on
 /// the tree alone, so that the layout is the same for any number of threads.
 struct Run {
     uint32_t begin;
     uint32_t end;
-    std::vector<WideNode> wide;
-    uint32_t first_wide = 0;
+    const WideNode* wide = nullptr;
+    uint32_t count = 0;
+    uint32_t made_at = 0;  ///< what the indices in `wide` count the first as
+    uint32_t place = 0;    ///< of the first, among all
 };
 
 uint32_t run_length(size_t nodes) { return static_cast<uint32_t>(std::max<size_t>(512, nodes / 256)); }
@@ -34,11 +51,11 @@ struct Item {
 
 class Collapse {
  public:
-    Collapse(const Tree& tree, const LargeBuffer<Box3f>& boxes) : tree_(tree), boxes_(boxes) {}
+    Collapse(const Tree& tree, std::span<const Box3f> boxes) : tree_(tree), boxes_(boxes) {}
 
     /// Appends the wide node for a kd node and all below it; returns its index. A kd node listed in `runs` is not
     /// entered: its child code is the index of its run, marked for the caller to resolve.
-    uint32_t collapse(uint32_t kd_node, std::vector<WideNode>& out, const std::vector<Run>* runs) const {
+    uint32_t collapse(uint32_t kd_node, WideNodes& out, const std::vector<Run>* runs) const {
         return collapse(item(kd_node), out, runs);
     }
 
@@ -68,7 +85,7 @@ class Collapse {
         return found != runs->end() && found->begin == node ? &*found : nullptr;
     }
 
-    uint32_t collapse(const Item& root, std::vector<WideNode>& out, const std::vector<Run>* runs) const {
+    uint32_t collapse(const Item& root, WideNodes& out, const std::vector<Run>* runs) const {
         std::array<Item, WideNode::kWidth> items;
         // Per octant the slots of `items`, 4 bits each, the farthest lowest.
         std::array<uint32_t, 8> order{};
@@ -82,9 +99,10 @@ class Collapse {
             open(items, count, slot, order);
         }
 
-        const auto index = static_cast<uint32_t>(out.size());
-        out.emplace_back();
-        WideNode made{};
+        const uint32_t index = out.add();
+        WideNode& made = out.data()[index];
+        made = {};
+        std::fill_n(made.child, WideNode::kWidth, WideNode::leaf(0, 1));  // where no child is, no ray gets
         for (int i = 0; i < WideNode::kWidth; ++i) {
             const Box3f box = i < count ? items[static_cast<size_t>(i)].box : Box3f{};
             for (int axis = 0; axis < 3; ++axis) {
@@ -112,12 +130,11 @@ class Collapse {
             if (child.blocks != 0 && child.blocks <= WideNode::kMaxLeafBlocks) {
                 made.child[i] = WideNode::leaf(child.first_block, child.blocks);
             } else if (const Run* run = child.blocks == 0 ? find_run(runs, child.node) : nullptr; run != nullptr) {
-                made.child[i] = run->first_wide;
+                made.child[i] = run->place;
             } else {
                 made.child[i] = collapse(child, out, runs);
             }
         }
-        out[index] = made;
         return index;
     }
 
@@ -169,10 +186,9 @@ class Collapse {
             const bool left_is_nearer = (octant >> axis & 1U) == 0;
             const uint32_t near = left_is_nearer ? static_cast<uint32_t>(slot) : static_cast<uint32_t>(count);
             const uint32_t far = left_is_nearer ? static_cast<uint32_t>(count) : static_cast<uint32_t>(slot);
-            int shift = 0;
-            while ((order[octant] >> shift & 15U) != static_cast<uint32_t>(slot)) {
-                shift += 4;
-            }
+            // The lowest nibble that equals the slot.
+            const uint32_t differing = order[octant] ^ (static_cast<uint32_t>(slot) * 0x11111111U);
+            const int shift = std::countr_zero((differing - 0x11111111U) & ~differing & 0x88888888U) - 3;
             const uint32_t farther = order[octant] & ((1U << shift) - 1);
             const uint32_t nearer = static_cast<uint32_t>(uint64_t{order[octant]} >> (shift + 4) << (shift + 8));
             order[octant] = nearer | (near << (shift + 4)) | (far << shift) | farther;
@@ -181,7 +197,7 @@ class Collapse {
     }
 
     const Tree& tree_;
-    const LargeBuffer<Box3f>& boxes_;
+    std::span<const Box3f> boxes_;
 };
 
 /// Lists the runs below a node in depth-first order.
@@ -200,11 +216,10 @@ void find_runs(const Tree& tree, uint32_t begin, uint32_t end, uint32_t longest,
 
 }  // namespace
 
-void build_layout(const TriangleSoup& soup, const LargeBuffer<Box3f>& boxes, const LargeBuffer<uint32_t>& triangles,
+void build_layout(const TriangleSoup& soup, std::span<const Box3f> boxes, std::span<const uint32_t> triangles,
                   int threads, Tree& tree) {
     constexpr size_t kBlocksPerTask = 512;
     const size_t blocks = triangles.size() / kBlockSize;
-    tree.blocks = LargeBuffer<TriangleBlock>(blocks);
     const auto nodes = static_cast<uint32_t>(tree.nodes.size());
     if (blocks == 0) {
         return;
@@ -213,11 +228,20 @@ void build_layout(const TriangleSoup& soup, const LargeBuffer<Box3f>& boxes, con
     find_runs(tree, 0, nodes, run_length(nodes), runs);
 
     const Collapse collapse(tree, boxes);
+    const size_t most_wide_nodes = size_t{nodes} + blocks / (WideNode::kMaxLeafBlocks / 2) + 1;
+    std::vector<WideNodes> made(static_cast<size_t>(threads));
     const size_t block_tasks = (blocks + kBlocksPerTask - 1) / kBlocksPerTask;
-    parallel_for(threads, runs.size() + block_tasks, [&](size_t i) {
+    parallel_for(threads, runs.size() + block_tasks, [&](size_t i, int worker) {
         if (i < runs.size()) {
-            runs[i].wide.reserve((runs[i].end - runs[i].begin) / 6);
-            collapse.collapse(runs[i].begin, runs[i].wide, nullptr);
+            WideNodes& mine = made[static_cast<size_t>(worker)];
+            if (mine.data() == nullptr) {
+                mine = WideNodes(most_wide_nodes);
+            }
+            const uint32_t first = mine.count();
+            collapse.collapse(runs[i].begin, mine, nullptr);
+            runs[i].wide = mine.data() + first;
+            runs[i].count = mine.count() - first;
+            runs[i].made_at = first;
             return;
         }
         const size_t begin = (i - runs.size()) * kBlocksPerTask;
@@ -226,30 +250,30 @@ void build_layout(const TriangleSoup& soup, const LargeBuffer<Box3f>& boxes, con
     });
 
     // The wide nodes above the runs, whose number is small. A tree that is one run has none.
-    std::vector<WideNode> top;
-    const bool is_one_run = runs.size() == 1 && runs[0].begin == 0;
+    WideNodes top(most_wide_nodes);
     const auto place_runs = [&](uint32_t first) {
         for (Run& run : runs) {
-            run.first_wide = first;
-            first += static_cast<uint32_t>(run.wide.size());
+            run.place = first;
+            first += run.count;
         }
         return first;
     };
-    if (!is_one_run) {
+    if (runs.size() != 1 || runs[0].begin != 0) {
         collapse.collapse(0, top, &runs);  // once to learn its size, which the runs' places depend on
-        place_runs(static_cast<uint32_t>(top.size()));
+        place_runs(top.count());
         top.clear();
         collapse.collapse(0, top, &runs);
     }
-    tree.wide_nodes = LargeBuffer<WideNode>(place_runs(static_cast<uint32_t>(top.size())));
-    std::copy(top.begin(), top.end(), tree.wide_nodes.data());
+    tree.wide_nodes = LargeBuffer<WideNode>(place_runs(top.count()));
+    std::copy_n(top.data(), top.count(), tree.wide_nodes.data());
     parallel_for(threads, runs.size(), [&](size_t i) {
-        for (size_t n = 0; n < runs[i].wide.size(); ++n) {
-            WideNode& wide = tree.wide_nodes[runs[i].first_wide + n];
-            wide = runs[i].wide[n];
+        const Run& run = runs[i];
+        for (size_t n = 0; n < run.count; ++n) {
+            WideNode& wide = tree.wide_nodes[run.place + n];
+            wide = run.wide[n];
             for (int child = 0; child < WideNode::kWidth; ++child) {
                 if ((wide.child[child] & WideNode::kLeafFlag) == 0) {
-                    wide.child[child] += runs[i].first_wide;
+                    wide.child[child] += run.place - run.made_at;
                 }
             }
         }

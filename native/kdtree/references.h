@@ -48,8 +48,10 @@ class ReferenceBuffer {
     static constexpr size_t kSlack = 64;
 
     ReferenceBuffer() = default;
-    explicit ReferenceBuffer(size_t capacity)
-        : stride_((capacity + kSlack + 15) / 16 * 16 + 16), memory_(stride_ * kArrays) {
+    /// With address space for at least `later_bytes`, which the memory may be reused for.
+    explicit ReferenceBuffer(size_t capacity, size_t later_bytes = 0)
+        : stride_((capacity + kSlack + 15) / 16 * 16 + 16),
+          memory_(std::max(stride_ * kArrays, later_bytes / sizeof(uint32_t))) {
         for (size_t axis = 0; axis < 3; ++axis) {
             references_.lower[axis] = reinterpret_cast<float*>(memory_.data() + stride_ * axis);
             references_.upper[axis] = reinterpret_cast<float*>(memory_.data() + stride_ * (axis + 3));
@@ -58,6 +60,11 @@ class ReferenceBuffer {
     }
     const References& references() const { return references_; }
     size_t capacity() const { return stride_ - kSlack; }
+    /// Gives the memory away.
+    LargeBuffer<uint32_t> take_memory() {
+        references_ = {};
+        return std::move(memory_);
+    }
 
  private:
     size_t stride_ = 0;  ///< not a multiple of a page, so that the arrays do not compete for the same cache sets

@@ -48,7 +48,7 @@ TopLevels::TopLevels(const TriangleSoup& soup, const BuildParameters& parameters
       threads_(threads),
       kernels_(build_kernels()),
       segment_size_(choose_segment_size(soup.size(), threads)),
-      memory_(size_t{2} * soup.size() + 2 * with_slack(segment_size_)) {}
+      memory_(size_t{2} * soup.size() + 2 * with_slack(segment_size_), expected_block_bytes(soup.size())) {}
 
 void TopLevels::make_references() {
     const uint32_t triangles = soup_.size();

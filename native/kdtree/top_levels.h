@@ -19,8 +19,9 @@ struct Segment {
 /// Memory for segments, handed out to any thread.
 class SegmentMemory {
  public:
-    explicit SegmentMemory(size_t capacity) { buffers_.emplace_back(capacity); }
+    SegmentMemory(size_t capacity, size_t later_bytes) { buffers_.emplace_back(capacity, later_bytes); }
     References take(uint32_t count);
+    LargeBuffer<uint32_t> take_memory() { return buffers_.front().take_memory(); }
 
  private:
     std::mutex mutex_;
@@ -52,6 +53,8 @@ class TopLevels {
 
     const std::vector<TopNode>& nodes() const { return nodes_; }
     const RejectedFaces& rejected() const { return rejected_; }
+    /// Gives away the memory of the references, for when they are no longer needed.
+    LargeBuffer<uint32_t> take_memory() { return memory_.take_memory(); }
     /// Copies a node's references into one piece.
     void gather(const TopNode& node, const References& to) const;
 
@@ -83,6 +86,9 @@ class TopLevels {
     std::vector<BinCounts> counts_;  ///< per part
     RejectedFaces rejected_;
 };
+
+/// What the triangle blocks of most trees stay below: the memory of the references becomes theirs.
+inline size_t expected_block_bytes(uint32_t triangles) { return size_t{160} * triangles; }
 
 /// Room for the splits of the whole tree to add references, however hostile the scene: 6 for each triangle.
 inline uint64_t spare_references(uint32_t triangles) { return uint64_t{6} * triangles + 1024; }
