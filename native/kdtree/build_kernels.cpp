@@ -35,14 +35,10 @@ class SubtreeBuilder {
         if (input_.cancel != nullptr && input_.cancel->load(std::memory_order_relaxed)) {
             throw BuildCancelled();
         }
-        BinCounts counts{};
-        count_bins(references, node.count, node.tight, counts);
-        Split split = choose_split(node, counts, *input_.parameters);
-        if (Interval range; finer_range(node, split, range)) {
-            BinCounts finer{};
-            count_bins_along(split.axis, references, node.count, range.lower, range.upper, finer);
-            split = choose_finer_split(node, split, range, finer, *input_.parameters);
+        if (input_.sharing != nullptr && input_.sharing->is_wanted()) {
+            share();
         }
+        const Split split = find_split(node, references);
         if (split.axis < 0) {
             write_leaf(node, references);
             return;
@@ -61,29 +57,68 @@ class SubtreeBuilder {
             right_room = room + parts.right_count;
         }
         OpenNode left;
-        OpenNode right;
-        open_children(node, split, parts, left, right);
+        Waiting right{{}, right_begin, kNotGiven};
+        open_children(node, split, parts, left, right.node);
 
         const size_t index = output_.open_inner();
+        waiting_.push_back(&right);
         build(left, begin, right_room);
-        if (right_begin != begin && right_room + right.count > input_.references->capacity()) {
-            copy_references(at(right_begin), right.count, references);  // the parent's place is free
+        waiting_.pop_back();
+        if (right.given != kNotGiven) {
+            output_.close_inner_with_gap(index, split, right.given);
+            return;
+        }
+        if (right_begin != begin && right_room + right.node.count > input_.references->capacity()) {
+            copy_references(at(right_begin), right.node.count, references);  // the parent's place is free
             right_begin = begin;
             right_room = room;
         }
         const size_t right_child = output_.node_count();
-        build(right, right_begin, right_room);
+        build(right.node, right_begin, right_room);
         output_.close_inner(index, split, right_child);
     }
 
  private:
+    static constexpr uint32_t kNotGiven = 0xffffffffU;
+    static constexpr uint32_t kLeastToGive = 1024;  ///< references, below which giving costs more than it gains
+
+    /// A right child whose sibling is being built.
+    struct Waiting {
+        OpenNode node;
+        size_t begin;
+        uint32_t given = kNotGiven;  ///< number of the subtree that it became
+    };
+
     References at(size_t place) const { return input_.references->references().at(place); }
+
+    Split find_split(const OpenNode& node, const References& references) const {
+        BinCounts counts{};
+        count_bins(references, node.count, node.tight, counts);
+        const Split split = choose_split(node, counts, *input_.parameters);
+        Interval range;
+        if (!finer_range(node, split, range)) {
+            return split;
+        }
+        BinCounts finer{};
+        count_bins_along(split.axis, references, node.count, range.lower, range.upper, finer);
+        return choose_finer_split(node, split, range, finer, *input_.parameters);
+    }
+
+    /// Gives away the waiting node nearest to the root, which is the largest as a rule.
+    void share() {
+        for (Waiting* waiting : waiting_) {
+            if (waiting->given == kNotGiven && waiting->node.count >= kLeastToGive) {
+                waiting->given = input_.sharing->give(waiting->node, at(waiting->begin));
+                return;
+            }
+        }
+    }
 
     /// For scenes whose every plane leaves nearly all references on one side, or on both.
     void build_elsewhere(const OpenNode& node, const References& references) {
         const ReferenceBuffer buffer(subtree_room(node.count));
         copy_references(references, node.count, buffer.references());
-        const SubtreeInput input{input_.soup, input_.parameters, input_.cancel, &buffer};
+        const SubtreeInput input{input_.soup, input_.parameters, input_.cancel, &buffer, nullptr};
         SubtreeBuilder(input, output_).build(node, 0, node.count);
     }
 
@@ -94,6 +129,7 @@ class SubtreeBuilder {
 
     const SubtreeInput& input_;
     SubtreeOutput& output_;
+    std::vector<Waiting*> waiting_;  ///< from the root down
 };
 
 void build_subtree(const SubtreeInput& input, const OpenNode& node, SubtreeOutput& output) {

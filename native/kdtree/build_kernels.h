@@ -51,12 +51,25 @@ struct Partition {
     Box3f right_tight;
 };
 
+/// Where a thread that builds a subtree may give part of it to threads that have nothing to do.
+class SubtreeSharing {
+ public:
+    virtual ~SubtreeSharing() = default;
+    bool is_wanted() const { return idle_.load(std::memory_order_relaxed) > 0; }
+    /// Takes over a node and a copy of its references; returns the number of the new subtree.
+    virtual uint32_t give(const OpenNode& node, const References& references) = 0;
+
+ protected:
+    std::atomic<int> idle_{0};  ///< threads that wait for a subtree
+};
+
 /// What one thread needs while it builds a subtree.
 struct SubtreeInput {
     const TriangleSoup* soup;
     const BuildParameters* parameters;
     const std::atomic<bool>* cancel;
     const ReferenceBuffer* references;  ///< the node's own, at the start; behind them is room for right children
+    SubtreeSharing* sharing;            ///< null where one thread builds alone
 };
 
 /// Room for a subtree's references, and for the right children that wait while left ones are built: rarely more than as

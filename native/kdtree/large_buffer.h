@@ -20,7 +20,8 @@ class LargeBuffer {
 
  public:
     LargeBuffer() = default;
-    explicit LargeBuffer(size_t capacity) : capacity_(capacity) {
+    /// expected_bytes: how much will be used of a room that is larger than it needs to be.
+    explicit LargeBuffer(size_t capacity, size_t expected_bytes = SIZE_MAX) : capacity_(capacity) {
         if (capacity == 0) {
             return;
         }
@@ -28,7 +29,8 @@ class LargeBuffer {
             throw std::bad_alloc();
         }
         // A tail too short for a huge page of its own is left to small ones.
-        const size_t huge = (bytes() + kHugePage - kHugePagesFrom) / kHugePage * kHugePage;
+        const size_t huge =
+            expected_bytes < kHugePagesFrom ? 0 : (bytes() + kHugePage - kHugePagesFrom) / kHugePage * kHugePage;
         mapped_ = bytes() + (huge != 0 ? kHugePage : 0);
         void* memory =
             ::mmap(nullptr, mapped_, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);

@@ -16,7 +16,7 @@ namespace {
 class WideNodes {
  public:
     WideNodes() = default;
-    explicit WideNodes(size_t capacity) : nodes_(capacity) {}
+    WideNodes(size_t capacity, size_t expected) : nodes_(capacity, expected * sizeof(WideNode)) {}
     uint32_t add() { return count_++; }
     uint32_t count() const { return count_; }
     WideNode* data() { return nodes_.data(); }
@@ -235,7 +235,7 @@ void build_layout(const TriangleSoup& soup, std::span<const Box3f> boxes, std::s
         if (i < runs.size()) {
             WideNodes& mine = made[static_cast<size_t>(worker)];
             if (mine.data() == nullptr) {
-                mine = WideNodes(most_wide_nodes);
+                mine = WideNodes(most_wide_nodes, nodes / 8 / static_cast<size_t>(threads));
             }
             const uint32_t first = mine.count();
             collapse.collapse(runs[i].begin, mine, nullptr);
@@ -250,7 +250,7 @@ void build_layout(const TriangleSoup& soup, std::span<const Box3f> boxes, std::s
     });
 
     // The wide nodes above the runs, whose number is small. A tree that is one run has none.
-    WideNodes top(most_wide_nodes);
+    WideNodes top(most_wide_nodes, runs.size());
     const auto place_runs = [&](uint32_t first) {
         for (Run& run : runs) {
             run.place = first;

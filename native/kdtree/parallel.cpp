@@ -14,7 +14,7 @@
 namespace espalier {
 namespace {
 
-/// Looks at a value this often before it goes to sleep over it: a build has barriers microseconds apart.
+/// Looks at a value this often before it goes to sleep over it.
 constexpr int kSpins = 4000;
 
 void pause_briefly() {
@@ -23,17 +23,6 @@ void pause_briefly() {
 #elif defined(__aarch64__)
     asm volatile("yield");
 #endif
-}
-
-template <class T>
-void wait_while_equal(const std::atomic<T>& value, T old) {
-    for (int spin = 0; spin < kSpins; ++spin) {
-        if (value.load(std::memory_order_acquire) != old) {
-            return;
-        }
-        pause_briefly();
-    }
-    value.wait(old, std::memory_order_acquire);
 }
 
 /// One thread that sleeps until it is given a body to run.
@@ -52,7 +41,7 @@ class Pool {
             return;
         }
         const int helpers = grow(threads - 1);
-        remaining_.store(helpers, std::memory_order_relaxed);
+        remaining_.store(static_cast<uint32_t>(helpers), std::memory_order_relaxed);
         for (int i = 0; i < helpers; ++i) {
             Worker& worker = *workers_[static_cast<size_t>(i)];
             worker.body = body;
@@ -61,7 +50,7 @@ class Pool {
             worker.ticket.notify_one();
         }
         body(context, 0);
-        for (int left = remaining_.load(std::memory_order_acquire); left != 0;
+        for (uint32_t left = remaining_.load(std::memory_order_acquire); left != 0;
              left = remaining_.load(std::memory_order_acquire)) {
             wait_while_equal(remaining_, left);
         }
@@ -99,7 +88,7 @@ class Pool {
 
     std::mutex mutex_;
     std::vector<std::unique_ptr<Worker>> workers_;
-    std::atomic<int> remaining_{0};
+    std::atomic<uint32_t> remaining_{0};
 
  public:
     static thread_local bool is_worker;  ///< this thread already runs a body: what it starts, it runs alone
@@ -121,6 +110,16 @@ Pool& pool() {
 }
 
 }  // namespace
+
+void wait_while_equal(const std::atomic<uint32_t>& value, uint32_t old) {
+    for (int spin = 0; spin < kSpins; ++spin) {
+        if (value.load(std::memory_order_acquire) != old) {
+            return;
+        }
+        pause_briefly();
+    }
+    value.wait(old, std::memory_order_acquire);
+}
 
 int hardware_threads() {
     cpu_set_t allowed;

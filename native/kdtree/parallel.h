@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <atomic>
 #include <cstddef>
+#include <cstdint>
 #include <exception>
 #include <mutex>
 #include <type_traits>
@@ -12,6 +13,10 @@ namespace espalier {
 
 /// Threads this process may run on at the same time, at least 1.
 int hardware_threads();
+
+/// Waits for a change, awake for a fraction of a millisecond: a build has barriers microseconds apart. Whoever makes
+/// the change calls notify_all.
+void wait_while_equal(const std::atomic<uint32_t>& value, uint32_t old);
 
 /// Runs body(context, worker) once for each worker in [0, threads), worker 0 being the calling thread, and returns when
 /// all have ended. The threads are kept for the next call. While they are busy for another caller, and in calls made

@@ -7,6 +7,7 @@
 #include <cstring>
 #include <span>
 #include <stdexcept>
+#include <vector>
 
 #include "geometry/vec.h"
 #include "kdtree/large_buffer.h"
@@ -18,6 +19,15 @@ struct Split {
     int axis = -1;  ///< -1: the node is a leaf
     float position = 0;
     float cost = 0;
+};
+
+/// A right child that another thread builds: what it makes belongs between the nodes before `node` and those from there
+/// on, and its triangles likewise.
+struct Gap {
+    size_t inner;  ///< index of the parent
+    size_t node;
+    size_t triangle;
+    uint32_t subtree;  ///< which belongs there
 };
 
 /// The subtrees that one thread builds: nodes depth first, the tight box of each, and the triangles of the leaves in
@@ -49,6 +59,13 @@ class SubtreeOutput {
         box.extend(boxes_[right_child]);
         boxes_[index] = box;
     }
+    /// The same where the right child, which would come next, is built elsewhere. The box lacks it.
+    void close_inner_with_gap(size_t index, Split split, uint32_t subtree) {
+        nodes_[index] = KdNode::inner(split.axis, split.position, static_cast<uint32_t>(node_count_));
+        boxes_[index] = boxes_[index + 1];
+        gaps_.push_back({index, node_count_, triangle_count_, subtree});
+    }
+    const std::vector<Gap>& gaps() const { return gaps_; }
     /// Appends a leaf; returns the places of its triangles, whose last block is padded with kNoTriangle.
     uint32_t* add_leaf(uint32_t references) {
         const size_t index = open_inner();
@@ -98,6 +115,7 @@ class SubtreeOutput {
     size_t node_capacity_ = 0;
     size_t triangle_capacity_ = 0;
     LargeBuffer<std::byte> memory_;
+    std::vector<Gap> gaps_;
 };
 
 }  // namespace espalier

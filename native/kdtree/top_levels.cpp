@@ -216,7 +216,7 @@ std::vector<uint32_t> TopLevels::open_level(const std::vector<uint32_t>& level, 
     return next;
 }
 
-void TopLevels::gather(const TopNode& node, const References& to) const {
+void gather(const TopNode& node, const References& to) {
     size_t place = 0;
     for (const Segment& segment : node.segments) {
         copy_references(segment.references, segment.count, to.at(place));

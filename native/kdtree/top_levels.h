@@ -40,6 +40,9 @@ struct TopNode {
     bool is_split() const { return split.axis >= 0; }
 };
 
+/// Copies a node's references into one piece.
+void gather(const TopNode& node, const References& to);
+
 /// Phases 1 and 2: the references and the top of the tree, all threads on one level at a time.
 class TopLevels {
  public:
@@ -55,8 +58,6 @@ class TopLevels {
     const RejectedFaces& rejected() const { return rejected_; }
     /// Gives away the memory of the references, for when they are no longer needed.
     LargeBuffer<uint32_t> take_memory() { return memory_.take_memory(); }
-    /// Copies a node's references into one piece.
-    void gather(const TopNode& node, const References& to) const;
 
  private:
     struct Part {

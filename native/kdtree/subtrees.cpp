@@ -1,0 +1,283 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+#include "kdtree/subtrees.h"
+
+#include <algorithm>
+#include <stdexcept>
+
+#include "kdtree/parallel.h"
+
+namespace espalier {
+
+void Subtrees::add_whole(const OpenNode& root, ReferenceBuffer references) {
+    Subtree& subtree = subtrees_.emplace_back();
+    subtree.root = root;
+    subtree.references = std::move(references);
+    waiting_.push_back(&subtree);
+}
+
+void Subtrees::add_below(const TopLevels& top) {
+    for (const TopNode& node : top.nodes()) {
+        if (!node.is_split()) {
+            Subtree& subtree = subtrees_.emplace_back();
+            subtree.root = node.node;
+            subtree.top = &node;
+            waiting_.push_back(&subtree);
+            room_ = std::max(room_, subtree_room(node.node.count));
+        }
+    }
+    std::stable_sort(waiting_.begin(), waiting_.end(),
+                     [](const Subtree* a, const Subtree* b) { return a->root.count > b->root.count; });
+}
+
+void Subtrees::build() {
+    unfinished_ = waiting_.size();
+    parallel_for(threads_, static_cast<size_t>(threads_), [&](size_t, int worker) {
+        try {
+            while (Subtree* subtree = take()) {
+                build_one(*subtree, worker);
+                finish_one();
+            }
+        } catch (...) {
+            const std::lock_guard lock(mutex_);
+            is_abandoned_ = true;
+            changes_.fetch_add(1, std::memory_order_release);
+            changes_.notify_all();
+            throw;
+        }
+    });
+}
+
+/// The next subtree to build, waited for while there may be one; null when all are built.
+Subtrees::Subtree* Subtrees::take() {
+    bool is_idle = false;
+    for (;;) {
+        const uint32_t seen = changes_.load(std::memory_order_acquire);
+        {
+            const std::lock_guard lock(mutex_);
+            const bool has_ended = unfinished_ == 0 || is_abandoned_;
+            if (is_idle && (has_ended || !waiting_.empty())) {
+                idle_.fetch_sub(1, std::memory_order_relaxed);
+            }
+            if (has_ended) {
+                return nullptr;
+            }
+            if (!waiting_.empty()) {
+                Subtree* next = waiting_.front();
+                waiting_.pop_front();
+                return next;
+            }
+            if (!is_idle) {
+                is_idle = true;
+                idle_.fetch_add(1, std::memory_order_relaxed);
+            }
+        }
+        wait_while_equal(changes_, seen);
+    }
+}
+
+void Subtrees::finish_one() {
+    const std::lock_guard lock(mutex_);
+    if (--unfinished_ == 0) {
+        changes_.fetch_add(1, std::memory_order_release);
+        changes_.notify_all();
+    }
+}
+
+uint32_t Subtrees::give(const OpenNode& node, const References& references) {
+    ReferenceBuffer own(subtree_room(node.count));
+    copy_references(references, node.count, own.references());
+    const std::lock_guard lock(mutex_);
+    Subtree& subtree = subtrees_.emplace_back();
+    subtree.root = node;
+    subtree.references = std::move(own);
+    waiting_.push_back(&subtree);
+    ++unfinished_;
+    changes_.fetch_add(1, std::memory_order_release);
+    changes_.notify_all();
+    return static_cast<uint32_t>(subtrees_.size() - 1);
+}
+
+void Subtrees::build_one(Subtree& subtree, int worker) {
+    const auto w = static_cast<size_t>(worker);
+    const ReferenceBuffer* room = &subtree.references;
+    if (subtree.top != nullptr) {
+        if (rooms_[w].references().triangle == nullptr) {
+            rooms_[w] = ReferenceBuffer(room_);
+        }
+        gather(*subtree.top, rooms_[w].references());
+        room = &rooms_[w];
+    }
+    SubtreeOutput& output = outputs_[w];
+    if (output.nodes().data() == nullptr) {
+        output = SubtreeOutput(soup_.size() / static_cast<uint32_t>(threads_));
+    }
+    subtree.worker = worker;
+    subtree.first_node = output.node_count();
+    subtree.first_triangle = output.triangle_count();
+    subtree.first_gap = output.gaps().size();
+    SubtreeSharing* sharing = threads_ > 1 ? this : nullptr;
+    build_kernels().build_subtree({&soup_, &parameters_, cancel_, room, sharing}, subtree.root, output);
+    subtree.node_end = output.node_count();
+    subtree.triangle_end = output.triangle_count();
+    subtree.gap_end = output.gaps().size();
+    if (threads_ > 1) {
+        subtree.references = {};
+    }
+}
+
+void Subtrees::compact(TopLevels* top, Tree& tree) {
+    size_t nodes = 0;
+    size_t triangles = 0;
+    if (top == nullptr) {
+        place(subtrees_[0], nodes, triangles);
+    } else {
+        of_top_.assign(top->nodes().size(), nullptr);
+        top_places_.assign(top->nodes().size(), 0);
+        for (Subtree& subtree : subtrees_) {
+            if (subtree.top != nullptr) {
+                of_top_[static_cast<size_t>(subtree.top - top->nodes().data())] = &subtree;
+            }
+        }
+        place(*top, 0, nodes, triangles);
+    }
+    if (nodes > (1U << 30) || triangles / kBlockSize > kMaxBlocks) {
+        throw std::length_error("the tree needs more nodes or blocks than its indices can count");
+    }
+    LargeBuffer<uint32_t> references = top != nullptr ? top->take_memory() : subtrees_[0].references.take_memory();
+    tree.blocks = std::move(references).reuse_for<TriangleBlock>(triangles / kBlockSize);
+    tree.nodes = LargeBuffer<KdNode>(nodes);
+    if (top == nullptr) {
+        std::copy_n(outputs_[0].nodes().begin(), nodes, tree.nodes.data());
+        boxes_ = outputs_[0].boxes();
+        triangles_ = outputs_[0].triangles();
+        return;
+    }
+    joined_boxes_ = rooms_.front().take_memory().reuse_for<Box3f>(nodes);
+    joined_triangles_ = rooms_.back().take_memory().reuse_for<uint32_t>(triangles);
+    parallel_for(threads_, subtrees_.size(), [&](size_t i) { copy(subtrees_[i], tree); });
+    write_top(*top, 0, tree);
+    for (const Subtree& subtree : subtrees_) {
+        close_gaps(subtree, tree);
+    }
+    boxes_ = joined_boxes_.span();
+    triangles_ = joined_triangles_.span();
+}
+
+std::span<const Gap> Subtrees::gaps(const Subtree& subtree) const {
+    return std::span(outputs_[static_cast<size_t>(subtree.worker)].gaps())
+        .subspan(subtree.first_gap, subtree.gap_end - subtree.first_gap);
+}
+
+/// Gives a subtree and those that fill its gaps their places, in depth-first order.
+void Subtrees::place(Subtree& subtree, size_t& nodes, size_t& triangles) {
+    subtree.place = nodes;
+    subtree.triangle_place = triangles;
+    size_t node = subtree.first_node;
+    size_t triangle = subtree.first_triangle;
+    for (const Gap& gap : gaps(subtree)) {
+        nodes += gap.node - node;
+        triangles += gap.triangle - triangle;
+        place(subtrees_[gap.subtree], nodes, triangles);
+        node = gap.node;
+        triangle = gap.triangle;
+    }
+    nodes += subtree.node_end - node;
+    triangles += subtree.triangle_end - triangle;
+    subtree.place_end = nodes;
+    subtree.triangle_place_end = triangles;
+}
+
+void Subtrees::place(const TopLevels& top, uint32_t index, size_t& nodes, size_t& triangles) {
+    top_places_[index] = nodes;
+    if (Subtree* subtree = of_top_[index]; subtree != nullptr) {
+        place(*subtree, nodes, triangles);
+        return;
+    }
+    ++nodes;
+    place(top, top.nodes()[index].left, nodes, triangles);
+    place(top, top.nodes()[index].right, nodes, triangles);
+}
+
+/// The final place of a node of the thread's output.
+size_t Subtrees::place_of(const Subtree& subtree, size_t node) const {
+    size_t place = subtree.place + (node - subtree.first_node);
+    for (const Gap& gap : gaps(subtree)) {
+        if (gap.node <= node) {
+            place += subtrees_[gap.subtree].place_end - subtrees_[gap.subtree].place;
+        }
+    }
+    return place;
+}
+
+void Subtrees::copy(const Subtree& subtree, Tree& tree) {
+    const SubtreeOutput& output = outputs_[static_cast<size_t>(subtree.worker)];
+    size_t node = subtree.first_node;
+    size_t triangle = subtree.first_triangle;
+    size_t place = subtree.place;
+    size_t triangle_place = subtree.triangle_place;
+    const auto copy_up_to = [&](size_t node_end, size_t triangle_end) {
+        for (size_t i = node; i < node_end; ++i) {
+            const KdNode from = output.nodes()[i];
+            KdNode& to = tree.nodes[place + i - node];
+            if (from.is_leaf()) {
+                const size_t block = from.first_block() - triangle / kBlockSize + triangle_place / kBlockSize;
+                to = KdNode::leaf(static_cast<uint32_t>(block), from.references());
+            } else {
+                const size_t right = from.right_child();
+                const size_t right_place = right < node_end ? place + right - node : place_of(subtree, right);
+                to = KdNode::inner(from.axis(), from.split(), static_cast<uint32_t>(right_place));
+            }
+        }
+        std::copy(output.boxes().begin() + static_cast<std::ptrdiff_t>(node),
+                  output.boxes().begin() + static_cast<std::ptrdiff_t>(node_end), joined_boxes_.data() + place);
+        std::copy(output.triangles().begin() + static_cast<std::ptrdiff_t>(triangle),
+                  output.triangles().begin() + static_cast<std::ptrdiff_t>(triangle_end),
+                  joined_triangles_.data() + triangle_place);
+    };
+    for (const Gap& gap : gaps(subtree)) {
+        copy_up_to(gap.node, gap.triangle);
+        place = subtrees_[gap.subtree].place_end;
+        triangle_place = subtrees_[gap.subtree].triangle_place_end;
+        node = gap.node;
+        triangle = gap.triangle;
+    }
+    copy_up_to(subtree.node_end, subtree.triangle_end);
+}
+
+void Subtrees::write_top(const TopLevels& top, uint32_t index, Tree& tree) {
+    const TopNode& node = top.nodes()[index];
+    if (!node.is_split()) {
+        return;
+    }
+    write_top(top, node.left, tree);
+    write_top(top, node.right, tree);
+    const size_t right = top_places_[node.right];
+    tree.nodes[top_places_[index]] = KdNode::inner(node.split.axis, node.split.position, static_cast<uint32_t>(right));
+    Box3f box = joined_boxes_[top_places_[node.left]];
+    box.extend(joined_boxes_[right]);
+    joined_boxes_[top_places_[index]] = box;
+}
+
+/// Links the subtrees that fill gaps, and adds their boxes to those above them.
+void Subtrees::close_gaps(const Subtree& subtree, Tree& tree) {
+    for (const Gap& gap : gaps(subtree)) {
+        const size_t parent = place_of(subtree, gap.inner);
+        const KdNode node = tree.nodes[parent];
+        tree.nodes[parent] =
+            KdNode::inner(node.axis(), node.split(), static_cast<uint32_t>(subtrees_[gap.subtree].place));
+        extend_boxes(tree, 0, parent);
+    }
+}
+
+/// Boxes from a node on the way to `last` down to it, which come out right from the last up.
+void Subtrees::extend_boxes(const Tree& tree, size_t index, size_t last) {
+    const size_t right = tree.nodes[index].right_child();
+    if (index != last) {
+        extend_boxes(tree, last < right ? index + 1 : right, last);
+    }
+    Box3f box = joined_boxes_[index + 1];
+    box.extend(joined_boxes_[right]);
+    joined_boxes_[index] = box;
+}
+
+}  // namespace espalier

@@ -1,0 +1,101 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+#pragma once
+
+#include <deque>
+#include <mutex>
+#include <span>
+#include <vector>
+
+#include "kdtree/build_kernels.h"
+#include "kdtree/top_levels.h"
+
+namespace espalier {
+
+/// Phases 3 and 4: the subtrees below the top levels, and all nodes in their depth-first places. Threads take whole
+/// subtrees, the largest first; one that finds none left is given part of one that is still being built. Which thread
+/// builds what decides where it lies until phase 4, never what the tree is.
+class Subtrees : public SubtreeSharing {
+ public:
+    Subtrees(const TriangleSoup& soup, const BuildParameters& parameters, const std::atomic<bool>* cancel, int threads)
+        : soup_(soup),
+          parameters_(parameters),
+          cancel_(cancel),
+          threads_(threads),
+          outputs_(static_cast<size_t>(threads)),
+          rooms_(static_cast<size_t>(threads)) {}
+
+    /// One subtree that is the whole tree, built where its references lie.
+    void add_whole(const OpenNode& root, ReferenceBuffer references);
+    /// A subtree for each node that the top levels left unsplit.
+    void add_below(const TopLevels& top);
+
+    /// Phase 3.
+    void build();
+    /// Phase 4: fills in tree.nodes, and makes room for tree.blocks in memory that is no longer needed. `top` is null
+    /// for a whole tree.
+    void compact(TopLevels* top, Tree& tree);
+
+    /// After compaction: tight, per node.
+    std::span<const Box3f> boxes() const { return boxes_; }
+    /// After compaction: kBlockSize face indices per block.
+    std::span<const uint32_t> triangles() const { return triangles_; }
+
+    uint32_t give(const OpenNode& node, const References& references) override;
+
+ private:
+    struct Subtree {
+        OpenNode root;
+        const TopNode* top = nullptr;  ///< whose segments hold the references; null if they lie in `references`
+        ReferenceBuffer references;
+        // Where the thread that built it put it:
+        int worker = 0;
+        size_t first_node = 0;
+        size_t node_end = 0;
+        size_t first_triangle = 0;
+        size_t triangle_end = 0;
+        size_t first_gap = 0;
+        size_t gap_end = 0;
+        // Where it goes:
+        size_t place = 0;
+        size_t place_end = 0;
+        size_t triangle_place = 0;
+        size_t triangle_place_end = 0;
+    };
+
+    Subtree* take();
+    void finish_one();
+    void build_one(Subtree& subtree, int worker);
+    std::span<const Gap> gaps(const Subtree& subtree) const;
+    void place(Subtree& subtree, size_t& nodes, size_t& triangles);
+    void place(const TopLevels& top, uint32_t index, size_t& nodes, size_t& triangles);
+    void copy(const Subtree& subtree, Tree& tree);
+    void write_top(const TopLevels& top, uint32_t index, Tree& tree);
+    void close_gaps(const Subtree& subtree, Tree& tree);
+    void extend_boxes(const Tree& tree, size_t index, size_t last);
+    size_t place_of(const Subtree& subtree, size_t node) const;
+
+    const TriangleSoup& soup_;
+    const BuildParameters& parameters_;
+    const std::atomic<bool>* cancel_;
+    const int threads_;
+
+    std::mutex mutex_;
+    std::deque<Subtree> subtrees_;
+    std::deque<Subtree*> waiting_;
+    size_t unfinished_ = 0;
+    bool is_abandoned_ = false;
+    std::atomic<uint32_t> changes_{0};  ///< of the four above
+
+    std::vector<SubtreeOutput> outputs_;  ///< per thread
+    std::vector<ReferenceBuffer> rooms_;  ///< per thread
+    size_t room_ = 0;                     ///< references that each of them holds
+
+    std::vector<Subtree*> of_top_;    ///< per top node; null where the node is split
+    std::vector<size_t> top_places_;  ///< per top node
+    LargeBuffer<Box3f> joined_boxes_;
+    LargeBuffer<uint32_t> joined_triangles_;
+    std::span<const Box3f> boxes_;
+    std::span<const uint32_t> triangles_;
+};
+
+}  // namespace espalier
