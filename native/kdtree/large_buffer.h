@@ -70,11 +70,13 @@ class LargeBuffer {
         reused.data_ = reinterpret_cast<U*>(data_);
         reused.capacity_ = capacity;
         reused.mapping_ = std::exchange(mapping_, nullptr);
-        const auto begin = reinterpret_cast<uintptr_t>(reused.mapping_);
-        const auto end = (reinterpret_cast<uintptr_t>(reused.data_ + capacity) + kPage - 1) / kPage * kPage;
-        reused.mapped_ = end - begin;
-        if (reused.mapped_ < mapped_) {
-            ::munmap(reinterpret_cast<void*>(end), mapped_ - reused.mapped_);
+        reused.mapped_ = mapped_;
+        const size_t needed =
+            reinterpret_cast<uintptr_t>(reused.data_ + capacity) - reinterpret_cast<uintptr_t>(reused.mapping_);
+        const size_t kept = (needed + kPage - 1) / kPage * kPage;
+        if (kept < mapped_) {
+            ::munmap(static_cast<std::byte*>(reused.mapping_) + kept, mapped_ - kept);
+            reused.mapped_ = kept;
         }
         data_ = nullptr;
         capacity_ = mapped_ = 0;
