@@ -123,13 +123,13 @@ class Stream {
     Stream(const Tree& tree, std::span<const Ray> rays)
         : nodes_(tree.wide_nodes.data()), blocks_(tree.blocks.data()), extent_(extent_of(tree)), rays_(rays) {}
 
-    /// Calls done(ray) for each ray when its way has ended.
+    /// Traces the rays of these numbers and calls done(ray) for each when its way has ended.
     template <class Done>
-    HWY_INLINE void run(const Done& done) {
-        uint32_t begun = 0;
-        const auto count = static_cast<uint32_t>(rays_.size());
+    HWY_INLINE void run(std::span<const uint32_t> numbers, const Done& done) {
+        size_t begun = 0;
+        const size_t count = numbers.size();
         for (uint32_t slot = 0; slot < kInFlight && begun < count; ++slot) {
-            begin(ray_[slot], begun++);
+            begin(ray_[slot], numbers[begun++]);
         }
         while ((at_node_ | at_leaf_ | at_end_) != 0) {
             // Each list is read from its front while rays are put behind; as each ray is put back once at most, a list
@@ -167,7 +167,7 @@ class Stream {
             for (uint32_t i = 0; i < ended; ++i) {
                 done(*end_list_[i]);
                 if (begun < count) {
-                    begin(*end_list_[i], begun++);
+                    begin(*end_list_[i], numbers[begun++]);
                 }
             }
         }

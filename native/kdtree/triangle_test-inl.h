@@ -52,6 +52,27 @@ HWY_INLINE V largest_of(const V (&c)[3]) {
     return hn::Max(hn::Max(hn::Abs(c[0]), hn::Abs(c[1])), hn::Abs(c[2]));
 }
 
+/// Reads blocks lane by lane, those of a second block behind the first's; a single block stands for both.
+class BlockLoader {
+ public:
+    HWY_INLINE BlockLoader(const TriangleBlock* block, bool is_single)
+        : first_(block->vertex[0][0]), second_(block[is_single ? 0 : 1].vertex[0][0]) {}
+
+    HWY_INLINE auto operator()(size_t from) const {
+        const hn::CappedTag<float, kBlocksPerStep * kBlockSize> d;
+        if constexpr (kBlocksPerStep == 2) {
+            const hn::Half<decltype(d)> half;
+            return hn::Combine(d, hn::Load(half, second_ + from), hn::Load(half, first_ + from));
+        } else {
+            return hn::Load(d, first_ + from);
+        }
+    }
+
+ private:
+    const float* first_;
+    [[maybe_unused]] const float* second_;
+};
+
 /// The lanes of a block, and of the one behind it where a step takes two, that the ray may hit within [start, reach];
 /// every lane that it does hit is among them.
 ///
@@ -73,16 +94,7 @@ HWY_INLINE uint32_t test_blocks(const TracedRay& ray, const TriangleBlock* block
     const hn::CappedTag<float, kBlocksPerStep * kBlockSize> d;
     constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<float, kBlocksPerStep * kBlockSize>());
     using V = hn::Vec<decltype(d)>;
-    const float* corners = block->vertex[0][0];
-    [[maybe_unused]] const float* second = block[is_single ? 0 : 1].vertex[0][0];
-    const auto load = [&](size_t from) {
-        if constexpr (kBlocksPerStep == 2) {
-            const hn::Half<decltype(d)> half;
-            return hn::Combine(d, hn::Load(half, second + from), hn::Load(half, corners + from));
-        } else {
-            return hn::Load(d, corners + from);
-        }
-    };
+    const BlockLoader load(block, is_single);
     uint32_t possible = 0;
     for (size_t first = 0; first < kBlockSize; first += kLanes) {
         V x[3];

@@ -1,6 +1,11 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 #include <gtest/gtest.h>
 
+#include <algorithm>
+#include <cstring>
+#include <numeric>
+#include <random>
+
 #include "kdtree/traversal.h"
 #include "meshes.h"
 
@@ -105,6 +110,114 @@ TEST(Traversal, LosesNoHit) {
             EXPECT_EQ(different, 0U);
             EXPECT_EQ(contradicted, 0U);
         }
+    }
+}
+
+/// Rays as pictures have them, which are traced as packets: from one point, towards one point, and at its near side
+/// hits whose distance ties with t_min or t_max.
+std::vector<Ray> make_coherent_rays(const Mesh& mesh, uint32_t seed) {
+    std::mt19937 random(seed);
+    const auto uniform = [&] { return static_cast<float>(random() >> 8) * 0x1p-24F; };
+    const Tree tree = build(mesh.soup(), {Quality::kDraft, 1});
+    const float extent = length(tree.bounds.size());
+    const Vec3f size{extent, extent, extent};
+    const Vec3f middle = (tree.bounds.lower + tree.bounds.upper) * 0.5F;
+    std::vector<Ray> rays;
+    for (int view = 0; view < 12; ++view) {
+        // Some views run straight along an axis; some spread too far for a packet, or across octants.
+        const Vec3f eye = middle + size * Vec3f{view % 3 == 0 ? 0.0F : uniform() * 4 - 2, uniform() * 4 - 2,
+                                                view % 4 == 0 ? 3.0F : uniform() * 4 - 2};
+        const float width = view % 5 == 4 ? 0.5F : 0.01F;
+        std::vector<Ray> camera;
+        for (int patch = 0; patch < 12; ++patch) {
+            const float* corner = &mesh.positions[size_t{3} * (random() % (mesh.positions.size() / 3))];
+            const Vec3f target = patch % 4 != 0 ? Vec3f{corner[0], corner[1], corner[2]}
+                                                : middle + size * Vec3f{uniform() - 0.5F, uniform() - 0.5F, 0};
+            for (int i = 0; i < 16; ++i) {
+                const Vec3f off = patch % 3 == 0 && i == 5 ? Vec3f{} : Vec3f{uniform() - 0.5F, uniform() - 0.5F, 0};
+                camera.push_back({eye, 0, target + size * off * width - eye, INFINITY});
+            }
+        }
+        std::vector<Hit> hits(camera.size());
+        intersect(tree, camera, hits);
+        for (size_t i = 0; i < camera.size(); ++i) {
+            const Ray& ray = camera[i];
+            rays.push_back(ray);
+            if (hits[i].triangle >= 0 && i % 7 < 2) {
+                (i % 7 == 0 ? rays.back().t_min : rays.back().t_max) = hits[i].t;
+            }
+        }
+        const Vec3f lamp = middle + size * Vec3f{uniform() * 2 - 1, uniform() * 2 - 1, view % 2 == 0 ? 2.0F : 0.1F};
+        for (size_t i = 0; i < camera.size(); ++i) {
+            const float t = hits[i].triangle >= 0 ? hits[i].t * (1 - 0x1p-18F) : 1.0F;
+            const Vec3f point = camera[i].origin + camera[i].direction * t;
+            rays.push_back({point, 0, lamp - point, i % 5 == 0 ? 0.5F : 1.0F});
+        }
+    }
+    return rays;
+}
+
+/// Packets, streams and single rays give the same hits bit for bit, in any number and order.
+TEST(Traversal, IsTheSameInAnyBatch) {
+    Mesh far = make_sphere(24, 32);
+    for (float& x : far.positions) {
+        x += 1e4F;
+    }
+    const Mesh meshes[] = {make_sphere(24, 32), make_soup(1500, 11), make_furball(300), make_grid(20), far};
+    for (const Mesh& mesh : meshes) {
+        const Tree tree = build(mesh.soup(), {});
+        const Tree list = make_flat_list(mesh);
+        const std::vector<Ray> rays = make_coherent_rays(mesh, 5);
+        std::vector<Hit> hits(rays.size());
+        std::vector<uint8_t> blocked(rays.size());
+        intersect(tree, rays, hits);
+        occluded(tree, rays, blocked);
+        const auto is_same = [](const Hit& a, const Hit& b) { return std::memcmp(&a, &b, sizeof(Hit)) == 0; };
+
+        size_t found = 0;
+        size_t wrong_alone = 0;
+        for (size_t i = 0; i < rays.size(); ++i) {
+            Hit hit{};
+            uint8_t is_blocked = 0;
+            intersect(tree, {&rays[i], 1}, {&hit, 1});
+            occluded(tree, {&rays[i], 1}, {&is_blocked, 1});
+            found += hit.triangle >= 0 ? 1U : 0U;
+            wrong_alone +=
+                is_same(hit, hits[i]) && is_blocked == blocked[i] && (hit.triangle >= 0) == (is_blocked != 0) ? 0U : 1U;
+        }
+        EXPECT_GT(found, 30U);
+        EXPECT_EQ(wrong_alone, 0U);
+
+        std::vector<Hit> expected(rays.size());
+        intersect(list, rays, expected);
+        size_t wrong_in_tree = 0;
+        for (size_t i = 0; i < rays.size(); ++i) {
+            wrong_in_tree += is_same(hits[i], expected[i]) ? 0U : 1U;
+        }
+        EXPECT_EQ(wrong_in_tree, 0U);
+
+        std::vector<size_t> order(rays.size());
+        std::iota(order.begin(), order.end(), size_t{0});
+        std::shuffle(order.begin(), order.end(), std::mt19937(3));
+        std::vector<Ray> shuffled;
+        for (const size_t i : order) {
+            shuffled.push_back(rays[i]);
+        }
+        std::vector<Hit> shuffled_hits(rays.size());
+        std::vector<uint8_t> shuffled_blocked(rays.size());
+        // Odd pieces, so that packets begin anywhere.
+        for (size_t begin = 0; begin < rays.size(); begin += 37) {
+            const size_t count = std::min<size_t>(37, rays.size() - begin);
+            intersect(tree, std::span(shuffled).subspan(begin, count), std::span(shuffled_hits).subspan(begin, count));
+            occluded(tree, std::span(shuffled).subspan(begin, count),
+                     std::span(shuffled_blocked).subspan(begin, count));
+        }
+        size_t wrong_shuffled = 0;
+        for (size_t i = 0; i < rays.size(); ++i) {
+            wrong_shuffled +=
+                is_same(shuffled_hits[i], hits[order[i]]) && shuffled_blocked[i] == blocked[order[i]] ? 0U : 1U;
+        }
+        EXPECT_EQ(wrong_shuffled, 0U);
     }
 }
 

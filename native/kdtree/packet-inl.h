@@ -1,0 +1,642 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+// Sixteen rays on one way through the tree, where all of them start or all of them end in the same point: rays of a
+// camera, or of a lamp. Compiled once per instruction set (see traversal.cpp).
+
+#if defined(ESPALIER_KDTREE_PACKET_INL_H_) == defined(HWY_TARGET_TOGGLE)
+#ifdef ESPALIER_KDTREE_PACKET_INL_H_
+#undef ESPALIER_KDTREE_PACKET_INL_H_
+#else
+#define ESPALIER_KDTREE_PACKET_INL_H_
+#endif
+
+#include <hwy/highway.h>
+
+#include <bit>
+#include <cmath>
+#include <cstdint>
+
+#include "kdtree/candidate.h"
+#include "kdtree/traced_ray-inl.h"
+#include "kdtree/triangle_test-inl.h"
+
+HWY_BEFORE_NAMESPACE();
+namespace espalier::HWY_NAMESPACE {
+namespace hn = hwy::HWY_NAMESPACE;
+
+/// Rays through one point, the focus: their common origin, or the end (t = 1) that they share up to rounding. Seen from
+/// the focus they run in directions of one octant with the same largest component z; depths are measured along it.
+template <bool kAnyHit, bool kExact>
+class Packet {
+ public:
+    static constexpr size_t kRays = 16;
+
+    explicit Packet(const Tree& tree)
+        : nodes_(tree.wide_nodes.data()), blocks_(tree.blocks.data()), extent_(extent_of(tree)) {}
+
+    /// Sets the rays up if they make a packet.
+    HWY_INLINE bool gather(const Ray* rays) {
+        const Ray& first = rays[0];
+        const Ray& last = rays[kRays - 1];
+        rays_ = rays;
+        if (first.origin == last.origin) {
+            return from_focus(first.origin);
+        }
+        if constexpr (kAnyHit) {
+            const Vec3f end = first.origin + first.direction;
+            const Vec3f off = last.origin + last.direction - end;
+            const float size = std::abs(end.x) + std::abs(end.y) + std::abs(end.z);
+            if (std::abs(off.x) + std::abs(off.y) + std::abs(off.z) <= size * 0x1p-20F) {
+                return to_focus(end);
+            }
+        }
+        return false;
+    }
+
+    /// Traces the rays that have been set up.
+    HWY_INLINE void trace() {
+        size_t stacked = 0;
+        uint32_t child = 0;
+        for (;;) {
+            if ((child & WideNode::kLeafFlag) == 0) {
+                const size_t pushed = visit_node(child, stacked);
+                for (size_t end = stacked + pushed; stacked != end; ++stacked) {
+                    prefetch(places_[stacked]);
+                }
+            } else {
+                const uint32_t first = WideNode::first_block(child);
+                const uint32_t end = first + WideNode::blocks(child);
+                for (uint32_t block = first; block < end; block += kBlocksPerStep) {
+                    visit_blocks(block, block + 1 == end);
+                }
+                if (kAnyHit && reach_ < 0) {
+                    return;
+                }
+            }
+            do {
+                if (stacked == 0) {
+                    return;
+                }
+                --stacked;
+            } while (depths_[stacked] > reach_ || !any_enters(places_[stacked]));
+            child = nodes_[places_[stacked] / WideNode::kWidth].child[places_[stacked] % WideNode::kWidth];
+        }
+    }
+
+    uint32_t place(size_t lane) const { return place_[lane]; }
+
+ private:
+    using D = hn::CappedTag<float, kRays>;
+    using V = hn::Vec<D>;
+    static constexpr D d{};
+    static constexpr hn::RebindToUnsigned<D> du{};
+    static constexpr size_t kLanes = hn::MaxLanes(D());
+    static constexpr size_t kCapacity = 70 * (WideNode::kWidth - 1) + 3 * WideNode::kWidth;
+    /// Directions that differ by more are no packet.
+    static constexpr float kWidest = 0.125F;
+
+    HWY_INLINE V field(size_t lane, size_t offset) const {
+        const hn::RebindToSigned<D> di;
+        const auto index = hn::Mul(hn::Iota(di, static_cast<int32_t>(lane)), hn::Set(di, sizeof(Ray) / sizeof(float)));
+        return hn::GatherIndex(d, reinterpret_cast<const float*>(rays_) + offset, index);
+    }
+
+    /// Rays that start in one point.
+    HWY_INLINE bool from_focus(Vec3f focus) {
+        for (size_t lane = 0; lane < kRays; lane += kLanes) {
+            auto same = hn::Eq(field(lane, 0), hn::Set(d, focus.x));
+            same = hn::And(same, hn::Eq(field(lane, 1), hn::Set(d, focus.y)));
+            same = hn::And(same, hn::Eq(field(lane, 2), hn::Set(d, focus.z)));
+            if (!hn::AllTrue(d, same)) {
+                return false;
+            }
+            for (size_t axis = 0; axis < 3; ++axis) {
+                hn::Store(field(lane, 4 + axis), d, direction_[axis] + lane);
+            }
+        }
+        is_reversed_ = false;
+        return set_up(focus, {0, 0, 0});
+    }
+
+    /// Rays that end, at t = 1, in one point up to rounding, and not behind it.
+    HWY_INLINE bool to_focus(Vec3f focus) {
+        Vec3f deviation;
+        for (size_t axis = 0; axis < 3; ++axis) {
+            V largest = hn::Zero(d);
+            for (size_t lane = 0; lane < kRays; lane += kLanes) {
+                const V origin = field(lane, axis);
+                const V way = field(lane, 4 + axis);
+                const V end = hn::Add(origin, way);
+                // The sum and the difference are off by u of their results.
+                const V off =
+                    hn::MulAdd(hn::Abs(end), hn::Set(d, 0x1p-23F),
+                               hn::Mul(hn::Abs(hn::Sub(end, hn::Set(d, (&focus.x)[axis]))), hn::Set(d, 1 + 0x1p-20F)));
+                largest = hn::Max(largest, off);
+                hn::Store(hn::Neg(way), d, direction_[axis] + lane);
+                hn::Store(origin, d, origin_[axis] + lane);
+            }
+            (&deviation.x)[axis] = hn::GetLane(hn::MaxOfLanes(d, largest)) + kTiny;
+        }
+        for (size_t lane = 0; lane < kRays; lane += kLanes) {
+            if (!hn::AllTrue(d, hn::Le(field(lane, 7), hn::Set(d, 1.0F)))) {
+                return false;
+            }
+        }
+        is_reversed_ = true;
+        return set_up(focus, deviation);
+    }
+
+    HWY_INLINE bool set_up(Vec3f focus, Vec3f deviation) {
+        const Vec3f towards{direction_[0][0], direction_[1][0], direction_[2][0]};
+        const Vec3f size{std::abs(towards.x), std::abs(towards.y), std::abs(towards.z)};
+        const int kz = size.x > size.y ? (size.x > size.z ? 0 : 2) : (size.y > size.z ? 1 : 2);
+        const int kx = kz == 2 ? 0 : kz + 1;
+        const int ky = kx == 2 ? 0 : kx + 1;
+        const Vec3f far_end{direction_[0][kRays - 1], direction_[1][kRays - 1], direction_[2][kRays - 1]};
+        slope_x_ = 0.5F * (towards[kx] / towards[kz] + far_end[kx] / far_end[kz]);
+        slope_y_ = 0.5F * (towards[ky] / towards[kz] + far_end[ky] / far_end[kz]);
+        V widest_x = hn::Zero(d);
+        V widest_y = hn::Zero(d);
+        for (size_t lane = 0; lane < kRays; lane += kLanes) {
+            const V dx = hn::Load(d, direction_[kx] + lane);
+            const V dy = hn::Load(d, direction_[ky] + lane);
+            const V dz = hn::Load(d, direction_[kz] + lane);
+            const auto largest_is_z = hn::Ge(hn::Abs(dz), hn::Max(hn::Abs(dx), hn::Abs(dy)));
+            const auto differs = [&](V v, float f) { return f < 0 ? hn::Ge(v, hn::Zero(d)) : hn::Lt(v, hn::Zero(d)); };
+            const auto turns =
+                hn::Or(differs(dx, towards[kx]), hn::Or(differs(dy, towards[ky]), differs(dz, towards[kz])));
+            if (!hn::AllTrue(d, hn::AndNot(turns, largest_is_z))) {
+                return false;
+            }
+            const V sx = hn::Div(dx, dz);
+            const V sy = hn::Div(dy, dz);
+            const V off_x = hn::Sub(sx, hn::Set(d, slope_x_));
+            const V off_y = hn::Sub(sy, hn::Set(d, slope_y_));
+            widest_x = hn::Max(widest_x, hn::Abs(off_x));
+            widest_y = hn::Max(widest_y, hn::Abs(off_y));
+            hn::Store(sx, d, own_slope_x_ + lane);
+            hn::Store(sy, d, own_slope_y_ + lane);
+            hn::Store(off_x, d, off_x_ + lane);
+            hn::Store(off_y, d, off_y_ + lane);
+        }
+        spread_x_ = hn::GetLane(hn::MaxOfLanes(d, widest_x)) * (1 + 0x1p-20F) + 0x1p-22F;
+        spread_y_ = hn::GetLane(hn::MaxOfLanes(d, widest_y)) * (1 + 0x1p-20F) + 0x1p-22F;
+        if (spread_x_ > kWidest || spread_y_ > kWidest) {
+            return false;
+        }
+        x_ = static_cast<uint32_t>(kx) * kBlockSize;
+        y_ = static_cast<uint32_t>(ky) * kBlockSize;
+        z_ = static_cast<uint32_t>(kz) * kBlockSize;
+        focus_x_ = focus[kx];
+        focus_y_ = focus[ky];
+        focus_z_ = focus[kz];
+        deviation_ = deviation.x + deviation.y + deviation.z;
+        sign_ = towards[kz] < 0 ? -1.0F : 1.0F;
+        set_up_boxes(focus, deviation, towards, kz);
+        set_up_intervals(kz, deviation[kz]);
+        return true;
+    }
+
+    /// As in TracedRay::start_from, for the rays and for the two that bound them.
+    HWY_INLINE void set_up_boxes(Vec3f focus, Vec3f deviation, Vec3f towards, int kz) {
+        octant_ = 0;
+        const float farthest = extent_ + std::max({std::abs(focus.x), std::abs(focus.y), std::abs(focus.z)});
+        for (int axis = 0; axis < 3; ++axis) {
+            const bool negative = towards[axis] < 0;
+            octant_ |= negative ? 1U << axis : 0U;
+            const auto planes = static_cast<uint32_t>(axis * WideNode::kWidth);
+            near_planes_[axis] = planes + (negative ? 3 * WideNode::kWidth : 0);
+            far_planes_[axis] = planes + (negative ? 0 : 3 * WideNode::kWidth);
+            V least = hn::Set(d, kInfinity);
+            V most = hn::Zero(d);
+            const auto shifts = [&](V steepness, V& near, V& far) {
+                const V inverse = negative ? hn::Neg(steepness) : steepness;
+                const V shift = hn::Neg(hn::Mul(hn::Set(d, focus[axis]), inverse));
+                V room = hn::Abs(shift);
+#if !HWY_NATIVE_FMA
+                room = hn::MulAdd(hn::Set(d, extent_), steepness, room);
+#endif
+                const V flat = hn::IfThenElse(hn::Ge(steepness, hn::Set(d, 0x1p24F)), hn::Set(d, farthest * 0x1p-22F),
+                                              hn::Zero(d));
+                const V margin = hn::MulAdd(hn::Add(flat, hn::Set(d, deviation[axis])), steepness,
+                                            hn::MulAdd(room, hn::Set(d, 0x1p-22F), hn::Set(d, kTiny)));
+                near = hn::Sub(shift, margin);
+                far = hn::Add(shift, margin);
+                return inverse;
+            };
+            for (size_t lane = 0; lane < kRays; lane += kLanes) {
+                const V largest = hn::Abs(hn::Load(d, direction_[kz] + lane));
+                const V own =
+                    hn::Max(hn::Abs(hn::Load(d, direction_[axis] + lane)), hn::Mul(largest, hn::Set(d, 0x1p-25F)));
+                const V steepness = hn::Div(largest, own);
+                least = hn::Min(least, steepness);
+                most = hn::Max(most, steepness);
+                V near, far;
+                const V inverse = shifts(steepness, near, far);
+                hn::Store(inverse, d, inverse_[axis] + lane);
+                hn::Store(near, d, near_shift_[axis] + lane);
+                hn::Store(far, d, far_shift_[axis] + lane);
+            }
+            const V ends[2] = {hn::MinOfLanes(d, least), hn::MaxOfLanes(d, most)};
+            for (size_t end = 0; end < 2; ++end) {
+                V near, far;
+                bound_inverse_[axis][end] = hn::GetLane(shifts(ends[end], near, far));
+                bound_near_[axis][end] = hn::GetLane(near);
+                bound_far_[axis][end] = hn::GetLane(far);
+            }
+        }
+    }
+
+    /// The depths at which boxes count, seen from the focus, and those at which triangles do, seen from each origin.
+    HWY_INLINE void set_up_intervals(int kz, float deviation) {
+        V least = hn::Set(d, kInfinity);
+        for (size_t lane = 0; lane < kRays; lane += kLanes) {
+            const V size = hn::Abs(hn::Load(d, direction_[kz] + lane));
+            const V t_min = field(lane, 3);
+            const V t_max = field(lane, 7);
+            const V tiny = hn::Set(d, kTiny);
+            const V below = hn::Set(d, 1 - 0x1p-21F);
+            const V above = hn::Set(d, 1 + 0x1p-21F);
+            const V from = hn::Mul(t_min, size);
+            const V to = hn::Mul(t_max, size);
+            const V start = hn::Sub(hn::Mul(from, below), tiny);
+            const V reach = hn::MulAdd(to, hn::Set(d, 1 + 0x1p-20F), tiny);
+            hn::Store(start, d, start_ + lane);
+            hn::Store(reach, d, reaches_ + lane);
+            hn::Store(hn::MulAdd(from, above, tiny), d, sure_start_ + lane);
+            hn::Store(hn::Sub(hn::Mul(to, below), tiny), d, sure_end_ + lane);
+            hn::Store(hn::Inf(d), d, lower_ + lane);
+            hn::Store(hn::Set(du, kNoPlace), du, place_ + lane);
+            hn::Store(hn::Set(du, kNoTriangle), du, triangle_ + lane);
+            V box_start = start;
+            V box_reach = reach;
+            if (is_reversed_) {
+                const V one = hn::Set(d, 1.0F);
+                const V room = hn::MulAdd(size, hn::Set(d, 0x1p-21F), hn::Set(d, deviation));
+                box_start = hn::Sub(hn::Mul(hn::Sub(one, t_max), size), room);
+                box_reach = hn::MulAdd(hn::Sub(one, t_min), size, room);
+            }
+            hn::Store(box_start, d, box_start_ + lane);
+            hn::Store(box_reach, d, box_reach_ + lane);
+            least = hn::Min(least, box_start);
+        }
+        entry_ = hn::GetLane(hn::MinOfLanes(d, least));
+        update_reach();
+    }
+
+    HWY_INLINE void update_reach() {
+        V most = hn::Set(d, -1.0F);
+        for (size_t lane = 0; lane < kRays; lane += kLanes) {
+            most = hn::Max(most, hn::Load(d, box_reach_ + lane));
+        }
+        reach_ = hn::GetLane(hn::MaxOfLanes(d, most));
+    }
+
+    /// Stacks the children that some ray may meet; returns their number.
+    HWY_INLINE size_t visit_node(uint32_t index, size_t stacked) {
+        const WideNode& node = nodes_[index];
+        const hn::CappedTag<float, WideNode::kWidth> d8;
+        const hn::RebindToUnsigned<decltype(d8)> du8;
+        constexpr size_t kHere = hn::MaxLanes(hn::CappedTag<float, WideNode::kWidth>());
+        const float* planes = node.lower[0];
+        alignas(32) float entries[WideNode::kWidth];
+        uint32_t met = 0;
+        for (size_t first = 0; first < WideNode::kWidth; first += kHere) {
+            auto entry = hn::Set(d8, entry_);
+            auto exit = hn::Set(d8, reach_);
+            for (int axis = 0; axis < 3; ++axis) {
+                const auto near = hn::Load(d8, planes + near_planes_[axis] + first);
+                const auto far = hn::Load(d8, planes + far_planes_[axis] + first);
+                const auto in0 =
+                    hn::MulAdd(near, hn::Set(d8, bound_inverse_[axis][0]), hn::Set(d8, bound_near_[axis][0]));
+                const auto in1 =
+                    hn::MulAdd(near, hn::Set(d8, bound_inverse_[axis][1]), hn::Set(d8, bound_near_[axis][1]));
+                const auto out0 =
+                    hn::MulAdd(far, hn::Set(d8, bound_inverse_[axis][0]), hn::Set(d8, bound_far_[axis][0]));
+                const auto out1 =
+                    hn::MulAdd(far, hn::Set(d8, bound_inverse_[axis][1]), hn::Set(d8, bound_far_[axis][1]));
+                entry = hn::Max(hn::Min(in0, in1), entry);
+                exit = hn::Min(hn::Max(out0, out1), exit);
+            }
+            const auto meets = hn::Le(entry, hn::Mul(exit, hn::Set(d8, 1 + 0x1p-21F)));
+#if HWY_TARGET != HWY_SSE4 && HWY_TARGET != HWY_NEON
+            const auto ranks = hn::Shr(hn::Set(du8, node.order[octant_]), hn::Mul(hn::Iota(du8, 0), hn::Set(du8, 3)));
+            const auto slots = hn::And(ranks, hn::Set(du8, 7));
+            const auto depth =
+                hn::TableLookupLanes(hn::IfThenElse(meets, entry, hn::Inf(d8)), hn::IndicesFromVec(d8, slots));
+            const auto pushed = hn::Lt(depth, hn::Inf(d8));
+            const auto place = hn::Add(slots, hn::Set(du8, index * WideNode::kWidth));
+            hn::StoreU(hn::Compress(place, hn::RebindMask(du8, pushed)), du8, places_ + stacked);
+            hn::StoreU(hn::Compress(depth, pushed), d8, depths_ + stacked);
+            return hn::CountTrue(d8, pushed);
+        }
+#else
+            hn::Store(entry, d8, entries + first);
+            met |= mask_bits(d8, meets) << first;
+        }
+        (void)du8;
+        size_t count = 0;
+        uint32_t order = node.order[octant_];
+        for (int i = 0; i < WideNode::kWidth; ++i, order >>= 3) {
+            const uint32_t slot = order & 7U;
+            places_[stacked + count] = index * WideNode::kWidth + slot;
+            depths_[stacked + count] = entries[slot];
+            count += met >> slot & 1U;
+        }
+        return count;
+#endif
+        (void)entries, (void)met;
+        return 0;
+    }
+
+    HWY_INLINE void prefetch(uint32_t place) const {
+        const uint32_t child = nodes_[place / WideNode::kWidth].child[place % WideNode::kWidth];
+        const char* wanted = (child & WideNode::kLeafFlag) != 0
+                                 ? reinterpret_cast<const char*>(blocks_ + WideNode::first_block(child))
+                                 : reinterpret_cast<const char*>(nodes_ + child);
+        for (int line = 0; line < 4; ++line) {
+            __builtin_prefetch(wanted + 64 * line);
+        }
+    }
+
+    /// Whether any ray enters the box of a node's child.
+    HWY_INLINE bool any_enters(uint32_t place) const {
+        const float* planes = nodes_[place / WideNode::kWidth].lower[0] + place % WideNode::kWidth;
+        for (size_t lane = 0; lane < kRays; lane += kLanes) {
+            V entry = hn::Load(d, box_start_ + lane);
+            V exit = hn::Load(d, box_reach_ + lane);
+            for (int axis = 0; axis < 3; ++axis) {
+                const V inverse = hn::Load(d, inverse_[axis] + lane);
+                entry = hn::Max(
+                    hn::MulAdd(hn::Set(d, planes[near_planes_[axis]]), inverse, hn::Load(d, near_shift_[axis] + lane)),
+                    entry);
+                exit = hn::Min(
+                    hn::MulAdd(hn::Set(d, planes[far_planes_[axis]]), inverse, hn::Load(d, far_shift_[axis] + lane)),
+                    exit);
+            }
+            if (!hn::AllFalse(d, hn::Le(entry, hn::Mul(exit, hn::Set(d, 1 + 0x1p-21F))))) {
+                return true;
+            }
+        }
+        return false;
+    }
+
+    /// What a block's triangles look like from the focus, sheared so that the packet's middle runs along z.
+    struct View {
+        static constexpr size_t kSize = kBlocksPerStep * kBlockSize;
+        alignas(64) float normal[3][3][kSize];  ///< [edge][axis]: an edge function is n.z - off_y n.y - off_x n.x
+        alignas(64) float bound[kSize];         ///< no edge function is off by more
+        alignas(64) float z[3][kSize];          ///< the first corner's, and of the others what they lie behind it
+        alignas(64) float size[kSize];          ///< the largest |z|
+    };
+
+    /// Tests the triangles of a block that are not wholly outside the packet.
+    ///
+    /// With u = 2^-24, slopes that are off by at most 2 u, h = the sum of both spreads and g = h mz: to the error of an
+    /// edge function in the middle, u (12 mx my + 10 mz (mx + my)) + 50 u^2 mz^2 as in test_blocks, come what the
+    /// slopes' errors do, 4 u mz (mx + my); what those of n.x and n.y do, each below u (8 mz^2 + 14 mz m) for m = mx or
+    /// my, so together u g (8 mz + 14 m); and the roundings of the two last sums, below 4 u g m. With s = mx + my + g +
+    /// 5.5 u mz all that is below u s (9.1 s + 14.1 mz). Lines that miss the focus by up to `deviation` change an edge
+    /// function by no more than 2 deviation s, once the shear has added its z to its x and y.
+    HWY_INLINE void visit_blocks(uint32_t index, bool is_single) {
+        const hn::CappedTag<float, View::kSize> d8;
+        constexpr size_t kHere = hn::MaxLanes(hn::CappedTag<float, View::kSize>());
+        using V8 = hn::Vec<decltype(d8)>;
+        View view;
+        uint32_t reached = 0;
+        const BlockLoader load(blocks_ + index, is_single);
+        for (size_t first = 0; first < View::kSize; first += kHere) {
+            V8 x[3];
+            V8 y[3];
+            V8 z[3];
+            for (size_t k = 0; k < 3; ++k) {
+                const size_t corner = k * 3 * kBlockSize + first;
+                z[k] = hn::Sub(load(corner + z_), hn::Set(d8, focus_z_));
+                x[k] = hn::NegMulAdd(hn::Set(d8, slope_x_), z[k], hn::Sub(load(corner + x_), hn::Set(d8, focus_x_)));
+                y[k] = hn::NegMulAdd(hn::Set(d8, slope_y_), z[k], hn::Sub(load(corner + y_), hn::Set(d8, focus_y_)));
+            }
+            const V8 mz = largest_of(z);
+            V8 bound = hn::Zero(d8);
+            if constexpr (kExact) {
+                const V8 s = hn::MulAdd(hn::Set(d8, spread_x_ + spread_y_ + 5.5F * 0x1p-24F), mz,
+                                        hn::Add(largest_of(x), largest_of(y)));
+                const V8 factor =
+                    hn::MulAdd(hn::Set(d8, 14.5F * 0x1p-24F), mz,
+                               hn::MulAdd(hn::Set(d8, 9.25F * 0x1p-24F), s, hn::Set(d8, 2.01F * deviation_)));
+                bound = hn::MulAdd(s, factor, hn::Set(d8, kTiny));
+            }
+            V8 most_inside = hn::Zero(d8);
+            V8 least_inside = hn::Zero(d8);
+            constexpr int kEdges[3][2] = {{2, 1}, {0, 2}, {1, 0}};
+            for (size_t e = 0; e < 3; ++e) {
+                const int a = kEdges[e][0];
+                const int b = kEdges[e][1];
+                const V8 nz = hn::MulSub(x[a], y[b], hn::Mul(y[a], x[b]));
+                const V8 ny = hn::MulSub(x[a], z[b], hn::Mul(z[a], x[b]));
+                const V8 nx = hn::MulSub(z[a], y[b], hn::Mul(y[a], z[b]));
+                const V8 range =
+                    hn::MulAdd(hn::Abs(nx), hn::Set(d8, spread_x_), hn::Mul(hn::Abs(ny), hn::Set(d8, spread_y_)));
+                const V8 high = hn::Add(nz, range);
+                const V8 low = hn::Sub(nz, range);
+                most_inside = e == 0 ? high : hn::Min(most_inside, high);
+                least_inside = e == 0 ? low : hn::Max(least_inside, low);
+                hn::Store(nx, d8, view.normal[e][0] + first);
+                hn::Store(ny, d8, view.normal[e][1] + first);
+                hn::Store(nz, d8, view.normal[e][2] + first);
+            }
+            const auto possible =
+                hn::Ge(hn::Max(most_inside, hn::Neg(least_inside)), hn::Neg(hn::Mul(bound, hn::Set(d8, 1 + 0x1p-10F))));
+            const V8 sign = hn::Set(d8, sign_);
+            const V8 depths[3] = {hn::Mul(z[0], sign), hn::Mul(z[1], sign), hn::Mul(z[2], sign)};
+            const V8 room = hn::MulAdd(mz, hn::Set(d8, 0x1p-20F), hn::Set(d8, kTiny));
+            const V8 nearest = hn::Sub(hn::Min(depths[0], hn::Min(depths[1], depths[2])), room);
+            const V8 farthest = hn::Add(hn::Max(depths[0], hn::Max(depths[1], depths[2])), room);
+            const auto in_range = hn::And(hn::Le(nearest, hn::Set(d8, reach_)), hn::Ge(farthest, hn::Set(d8, entry_)));
+            reached |= mask_bits(d8, hn::And(possible, in_range)) << first;
+            hn::Store(bound, d8, view.bound + first);
+            hn::Store(z[0], d8, view.z[0] + first);
+            hn::Store(hn::Sub(z[1], z[0]), d8, view.z[1] + first);
+            hn::Store(hn::Sub(z[2], z[0]), d8, view.z[2] + first);
+            hn::Store(mz, d8, view.size + first);
+        }
+        if (is_single) {
+            reached &= (1U << kBlockSize) - 1;
+        }
+        bool taken = false;
+        for (; reached != 0; reached &= reached - 1) {
+            const auto lane = static_cast<uint32_t>(std::countr_zero(reached));
+            taken |= test_from_focus(view, lane, index * kBlockSize + lane);
+        }
+        if (taken) {
+            update_reach();
+        }
+    }
+
+    HWY_INLINE bool test_from_focus(const View& view, uint32_t triangle, uint32_t place) {
+        bool taken = false;
+        const V bound = hn::Set(d, view.bound[triangle]);
+        for (size_t lane = 0; lane < kRays; lane += kLanes) {
+            const V off_x = hn::Load(d, off_x_ + lane);
+            const V off_y = hn::Load(d, off_y_ + lane);
+            V side[3];
+            for (size_t e = 0; e < 3; ++e) {
+                side[e] = hn::NegMulAdd(off_x, hn::Set(d, view.normal[e][0][triangle]),
+                                        hn::NegMulAdd(off_y, hn::Set(d, view.normal[e][1][triangle]),
+                                                      hn::Set(d, view.normal[e][2][triangle])));
+            }
+            const V inwards = depth_inside(side);
+            auto inside = hn::Ge(inwards, hn::Neg(bound));
+            if constexpr (kAnyHit) {
+                inside = hn::And(inside, hn::Ge(hn::Load(d, reaches_ + lane), hn::Zero(d)));
+            }
+            if (hn::AllFalse(d, inside)) {
+                continue;
+            }
+            if (kAnyHit && is_reversed_) {
+                taken |= test_from_origins(lane, place);
+                continue;
+            }
+            taken |= take(lane, side, inwards, inside, bound, hn::Set(d, view.size[triangle]),
+                          hn::Set(d, view.z[0][triangle]), hn::Set(d, view.z[1][triangle]),
+                          hn::Set(d, view.z[2][triangle]), sign_, place);
+        }
+        return taken;
+    }
+
+    /// How far inside the least convincing of three edge functions lies.
+    static HWY_INLINE V depth_inside(const V (&side)[3]) {
+        return hn::Max(hn::Min(side[0], hn::Min(side[1], side[2])),
+                       hn::Neg(hn::Max(side[0], hn::Max(side[1], side[2]))));
+    }
+
+    /// One triangle against each ray from its own origin, as test_blocks has it.
+    HWY_INLINE bool test_from_origins(size_t lane, uint32_t place) {
+        const float* corners = blocks_[place / kBlockSize].vertex[0][0] + place % kBlockSize;
+        const V ox = hn::Load(d, origin_[x_ / kBlockSize] + lane);
+        const V oy = hn::Load(d, origin_[y_ / kBlockSize] + lane);
+        const V oz = hn::Load(d, origin_[z_ / kBlockSize] + lane);
+        const V sx = hn::Load(d, own_slope_x_ + lane);
+        const V sy = hn::Load(d, own_slope_y_ + lane);
+        V x[3];
+        V y[3];
+        V z[3];
+        for (size_t k = 0; k < 3; ++k) {
+            const float* corner = corners + k * 3 * kBlockSize;
+            z[k] = hn::Sub(hn::Set(d, corner[z_]), oz);
+            x[k] = hn::NegMulAdd(sx, z[k], hn::Sub(hn::Set(d, corner[x_]), ox));
+            y[k] = hn::NegMulAdd(sy, z[k], hn::Sub(hn::Set(d, corner[y_]), oy));
+        }
+        const V side[3] = {hn::MulSub(x[2], y[1], hn::Mul(y[2], x[1])), hn::MulSub(x[0], y[2], hn::Mul(y[0], x[2])),
+                           hn::MulSub(x[1], y[0], hn::Mul(y[1], x[0]))};
+        V bound = hn::Zero(d);
+        const V mz = largest_of(z);
+        if constexpr (kExact) {
+            const V s = hn::MulAdd(hn::Set(d, 5.5F * 0x1p-24F), mz, hn::Add(largest_of(x), largest_of(y)));
+            bound =
+                hn::MulAdd(s, hn::MulAdd(hn::Set(d, 10.5F * 0x1p-24F), mz, hn::Mul(hn::Set(d, 3.25F * 0x1p-24F), s)),
+                           hn::Set(d, kTiny));
+        }
+        const V inwards = depth_inside(side);
+        const auto inside = hn::And(hn::Ge(inwards, hn::Neg(bound)), hn::Ge(hn::Load(d, reaches_ + lane), hn::Zero(d)));
+        if (hn::AllFalse(d, inside)) {
+            return false;
+        }
+        return take(lane, side, inwards, inside, bound, mz, z[0], hn::Sub(z[1], z[0]), hn::Sub(z[2], z[0]), -sign_,
+                    place);
+    }
+
+    /// Takes in a triangle for the rays that meet it, as Stream does. Depths are as test_blocks has them.
+    HWY_INLINE bool take(size_t lane, const V (&side)[3], V inwards, hn::Mask<D> inside, V bound, V mz, V z0, V r1,
+                         V r2, float sign, uint32_t place) {
+        const uint32_t triangle = triangle_at(blocks_, place);
+        const V reach = hn::Load(d, reaches_ + lane);
+        const V det = hn::Add(side[0], hn::Add(side[1], side[2]));
+        const V inverse = hn::Div(hn::Set(d, 1), det);
+        const V depth = hn::Mul(
+            hn::MulAdd(hn::Mul(side[1], inverse), r1, hn::MulAdd(hn::Mul(side[2], inverse), r2, z0)), hn::Set(d, sign));
+        V lower = depth;
+        V upper = depth;
+        auto certain = inside;
+        if constexpr (kExact) {
+            const V doubt =
+                hn::Mul(hn::Mul(hn::Mul(hn::Set(d, 8.5F), bound), hn::Abs(inverse)), hn::Max(hn::Abs(r1), hn::Abs(r2)));
+            const V error = hn::MulAdd(hn::Set(d, 0x1p-19F), mz, hn::Add(doubt, hn::Set(d, kTiny)));
+            const auto is_sound = hn::Ge(hn::Abs(det), hn::Max(hn::Mul(hn::Set(d, 32), bound), hn::Set(d, 0x1p-120F)));
+            lower = hn::IfThenElse(is_sound, hn::Sub(depth, error), hn::Set(d, -kInfinity));
+            upper = hn::IfThenElse(is_sound, hn::Add(depth, error), hn::Set(d, kInfinity));
+            certain = hn::And(is_sound, hn::Gt(inwards, bound));
+        }
+        const auto is_new = hn::Ne(hn::BitCast(du, hn::Load(du, triangle_ + lane)), hn::Set(du, triangle));
+        const auto counts = hn::And(hn::And(inside, hn::RebindMask(d, is_new)),
+                                    hn::And(hn::Le(lower, reach), hn::Ge(upper, hn::Load(d, start_ + lane))));
+        const auto in_range =
+            hn::And(hn::Ge(lower, hn::Load(d, sure_start_ + lane)), hn::Le(upper, hn::Load(d, sure_end_ + lane)));
+        const auto sure =
+            hn::And(hn::And(counts, certain), hn::And(in_range, hn::Lt(upper, hn::Load(d, lower_ + lane))));
+        bool taken = !hn::AllFalse(d, sure);
+        if (taken) {
+            const auto sure_u = hn::RebindMask(du, sure);
+            hn::Store(hn::IfThenElse(sure_u, hn::Set(du, place), hn::Load(du, place_ + lane)), du, place_ + lane);
+            hn::Store(hn::IfThenElse(sure_u, hn::Set(du, triangle), hn::Load(du, triangle_ + lane)), du,
+                      triangle_ + lane);
+            if constexpr (kAnyHit) {
+                hn::Store(hn::IfThenElse(sure, hn::Set(d, -1.0F), reach), d, reaches_ + lane);
+                hn::Store(hn::IfThenElse(sure, hn::Set(d, -1.0F), hn::Load(d, box_reach_ + lane)), d,
+                          box_reach_ + lane);
+            } else {
+                const V shortened = hn::MulAdd(upper, hn::Set(d, 1 + 0x1p-20F), hn::Set(d, kTiny));
+                hn::Store(hn::IfThenElse(sure, lower, hn::Load(d, lower_ + lane)), d, lower_ + lane);
+                hn::Store(hn::IfThenElse(sure, shortened, reach), d, reaches_ + lane);
+                hn::Store(hn::IfThenElse(sure, shortened, reach), d, box_reach_ + lane);
+            }
+        }
+        if constexpr (kExact) {
+            const auto open = hn::AndNot(sure, counts);
+            if (!hn::AllFalse(d, open)) {
+                for (uint32_t rest = mask_bits(d, open); rest != 0; rest &= rest - 1) {
+                    taken |= take_open(lane + static_cast<size_t>(std::countr_zero(rest)), triangle, place);
+                }
+            }
+        }
+        return taken;
+    }
+
+    HWY_NOINLINE bool take_open(size_t lane, uint32_t triangle, uint32_t place) {
+        Nearest nearest{place_[lane], lower_[lane], 0};
+        if (!take_exactly(rays_[lane], blocks_, place, nearest)) {
+            return false;
+        }
+        place_[lane] = place;
+        triangle_[lane] = triangle;
+        lower_[lane] = nearest.lower;
+        reaches_[lane] = kAnyHit ? -1.0F : nearest.upper * (1 + 0x1p-20F) + kTiny;
+        box_reach_[lane] = reaches_[lane];
+        return true;
+    }
+
+    const WideNode* nodes_;
+    const TriangleBlock* blocks_;
+    const Ray* rays_ = nullptr;
+    float extent_;
+    bool is_reversed_ = false;  ///< the focus is where the rays end
+    uint32_t octant_ = 0;
+    uint32_t near_planes_[3], far_planes_[3];
+    float bound_inverse_[3][2], bound_near_[3][2], bound_far_[3][2];  ///< of the least and the most steep ray
+    float entry_, reach_;                                             ///< no box counts outside these depths
+    uint32_t x_, y_, z_;                                              ///< as in TracedRay
+    float focus_x_, focus_y_, focus_z_;
+    float slope_x_, slope_y_, spread_x_, spread_y_;  ///< of the middle, and by how much rays differ from it
+    float sign_, deviation_;
+    alignas(64) float direction_[3][kRays];  ///< seen from the focus
+    alignas(64) float origin_[3][kRays];     ///< set where origins differ
+    alignas(64) float inverse_[3][kRays], near_shift_[3][kRays], far_shift_[3][kRays];
+    alignas(64) float own_slope_x_[kRays], own_slope_y_[kRays], off_x_[kRays], off_y_[kRays];
+    alignas(64) float start_[kRays], reaches_[kRays], sure_start_[kRays], sure_end_[kRays], lower_[kRays];
+    alignas(64) float box_start_[kRays], box_reach_[kRays];
+    alignas(64) uint32_t place_[kRays], triangle_[kRays];
+    uint32_t places_[kCapacity];  ///< what is to be visited: node * kWidth + slot of its child
+    float depths_[kCapacity];
+};
+
+}  // namespace espalier::HWY_NAMESPACE
+HWY_AFTER_NAMESPACE();
+#endif
