@@ -11,9 +11,8 @@
 
 #include <hwy/highway.h>
 
-#include <cstring>
-
 #include "kdtree/build_kernels.h"
+#include "kdtree/compress-inl.h"
 #include "kdtree/sah-inl.h"
 
 HWY_BEFORE_NAMESPACE();
@@ -124,15 +123,6 @@ HWY_INLINE void quantise(D df, const float* lower, const float* upper, Slices sl
             return hn::IfThenElse(exists, in_slices(values, at), hn::Set(df, 1.0F + static_cast<float>(kSlices)));
         });
     }
-}
-
-template <class D>
-HWY_INLINE uint64_t mask_bits(D d, hn::Mask<D> mask) {
-    uint8_t bytes[8] = {};
-    hn::StoreMaskBits(d, mask, bytes);
-    uint64_t bits = 0;
-    std::memcpy(&bits, bytes, sizeof bits);
-    return bits;
 }
 
 /// Bytes of [values, values + count) below first_bound, first_bound + 1, ...; count is a multiple of 64.

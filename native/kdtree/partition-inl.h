@@ -241,16 +241,20 @@ inline Partition partition(const TriangleSoup& soup, const References& from, uin
     DroppedHalves dropped;
     uint32_t left_count = 0;
     uint32_t right_count = 0;
-    for (uint32_t i = 0; i < count; i += lanes) {
-        const auto valid = hn::FirstN(d, count - i);
+    const auto sort = [&](uint32_t i, uint32_t size, auto store_left) {
+        const auto valid = hn::FirstN(d, size);
         const auto begins_before = hn::Lt(hn::LoadU(d, in.lower[a] + i), plane);
-        const auto to_left = hn::And(valid, begins_before);
         // What lies in the plane goes right.
+        const auto to_left = hn::And(valid, begins_before);
         const auto to_right =
             hn::And(valid, hn::Or(hn::Not(begins_before), hn::Gt(hn::LoadU(d, in.upper[a] + i), plane)));
         const auto to_both = hn::And(to_left, to_right);
         const auto tight_left = clip ? hn::AndNot(to_both, to_left) : to_left;
         const auto tight_right = clip ? hn::AndNot(to_both, to_right) : to_right;
+        const Compression compress_left(d, to_left);
+        const Compression compress_right(d, to_right);
+        const uint64_t left_bits = compress_left.bits();
+        const uint64_t right_bits = compress_right.bits();
         for (int axis = 0; axis < 3; ++axis) {
             const auto b = static_cast<size_t>(axis);
             const auto lower = hn::LoadU(d, in.lower[b] + i);
@@ -259,17 +263,14 @@ inline Partition partition(const TriangleSoup& soup, const References& from, uin
             const auto right_lower = b == a ? hn::Max(lower, plane) : lower;
             left_tight.extend(axis, tight_left, lower, left_upper);
             right_tight.extend(axis, tight_right, right_lower, upper);
-            hn::CompressBlendedStore(right_lower, to_right, d, right.lower[b] + right_count);
-            hn::CompressBlendedStore(upper, to_right, d, right.upper[b] + right_count);
-            hn::CompressBlendedStore(lower, to_left, d, left.lower[b] + left_count);
-            hn::CompressBlendedStore(left_upper, to_left, d, left.upper[b] + left_count);
+            compress_right.store(d, right_lower, right.lower[b] + right_count);
+            compress_right.store(d, upper, right.upper[b] + right_count);
+            store_left(compress_left, d, lower, left.lower[b] + left_count);
+            store_left(compress_left, d, left_upper, left.upper[b] + left_count);
         }
         const auto triangle = hn::LoadU(du, in.triangle + i);
-        hn::CompressBlendedStore(triangle, hn::RebindMask(du, to_right), du, right.triangle + right_count);
-        hn::CompressBlendedStore(triangle, hn::RebindMask(du, to_left), du, left.triangle + left_count);
-
-        const uint64_t left_bits = mask_bits(d, to_left);
-        const uint64_t right_bits = mask_bits(d, to_right);
+        compress_right.store(du, triangle, right.triangle + right_count);
+        store_left(compress_left, du, triangle, left.triangle + left_count);
         if (clip) {
             for (uint64_t both = left_bits & right_bits; both != 0; both &= both - 1) {
                 const uint64_t earlier = (both & -both) - 1;
@@ -285,6 +286,18 @@ inline Partition partition(const TriangleSoup& soup, const References& from, uin
         if (straddlers.count >= Straddlers::kFlushAt) {
             clip_straddlers(d, soup, split, left, right, straddlers, left_tight, right_tight, dropped);
         }
+    };
+    // Whole vectors may be stored although the left side lies in place: what they write past its end was read before.
+    // Only the last, partial one must leave alone what lies behind the node.
+    uint32_t i = 0;
+    for (; i + lanes <= count; i += lanes) {
+        sort(i, lanes, [](const auto& compress, auto tag, auto v, auto* to) { compress.store(tag, v, to); });
+    }
+    if (i < count) {
+        sort(i, count - i, [](const auto& compress, auto tag, auto v, auto* to) {
+            const auto size = static_cast<size_t>(std::popcount(compress.bits()));
+            hn::BlendedStore(compress(tag, v), hn::FirstN(tag, size), tag, to);
+        });
     }
     if (straddlers.count != 0) {
         clip_straddlers(d, soup, split, left, right, straddlers, left_tight, right_tight, dropped);
