@@ -2,6 +2,7 @@
 # make preview [SCENE=file]   sets everything up, draws the scene, prints what building its tree cost per thread count
 # make test                   sets everything up, runs the C++ and the Python tests
 # make long-run [RAYS=1e8]    judges so many hard rays in exact arithmetic, and says what follows from finding no error
+# make test-neon              the C++ tests under an emulator of ARM; the same tree and the same hits on all instruction sets
 # make package                build/espalier-VERSION.zip, the extension as users install it
 # make bench [BENCH=--quick]  measures builds and rays beside Embree on the meshes it finds; BENCH=--help tells more
 # make sanitize               the C++ tests under the address, undefined-behaviour and thread sanitizers
@@ -10,7 +11,7 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
-.PHONY: preview test test-native long-run package bench sanitize lint format blenders native system python clean
+.PHONY: preview test test-native test-neon long-run package bench sanitize lint format blenders native system python clean
 
 SCENE ?= build/scenes/interior.blend
 CACHE := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/espalier
@@ -48,6 +49,18 @@ RAYS := 1e8
 long-run: test-native native
 	@tools/environment .venv "3.11 3.13" -r requirements/test.txt
 	python -m tests.exactness $(RAYS)
+
+test-neon: python
+	@tools/need libgtest-dev g++-aarch64-linux-gnu qemu-user googletest
+	cmake --preset release
+	cmake --build --preset release -j $(JOBS) --target espalier_fingerprint
+	cmake --preset neon -Wno-deprecated
+	cmake --build --preset neon -j $(JOBS)
+	ctest --preset neon -j $(JOBS)
+	qemu-aarch64 -L /usr/aarch64-linux-gnu build/neon/espalier_fingerprint >build/neon/fingerprint
+	for set in $$(build/release/espalier_fingerprint sets); do \
+		ESPALIER_SIMD=$$set build/release/espalier_fingerprint | diff - build/neon/fingerprint || exit; \
+		echo "The same trees and the same hits on $$set and on neon"; done
 
 package: build/package.stamp
 build/package.stamp: $(NATIVE) $(ADDON) tools/package.py | native

@@ -33,7 +33,7 @@ class FloatEnvironment {
         asm volatile("mrs %0, fpcr" : "=r"(value));
         return value;
     }
-    static void write(Register value) { asm volatile("msr fpcr, %0" : : "r"(value)); }
+    static void write(Register value) { asm volatile("msr fpcr, %0" : : "r"(value) : "memory"); }
 #else
 #error "Say here how this processor's rounding and subnormal modes are set"
 #endif

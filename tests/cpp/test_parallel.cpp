@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 #include <gtest/gtest.h>
 
+#include <chrono>
 #include <stdexcept>
 #include <thread>
 #include <vector>
@@ -27,13 +28,15 @@ TEST(Parallel, VisitsEachIndexOnce) {
 }
 
 TEST(Parallel, PassesOnTheFirstException) {
+    // Each call takes its time, so that the others cannot be through before the exception has been noticed.
     std::atomic<int> after{0};
-    EXPECT_THROW(parallel_for(4, 100000,
+    EXPECT_THROW(parallel_for(4, 4000,
                               [&](size_t i) {
                                   if (i == 10) {
                                       throw std::runtime_error("ten");
                                   }
-                                  after += i > 90000 ? 1 : 0;
+                                  std::this_thread::sleep_for(std::chrono::microseconds(500));
+                                  after += i > 3000 ? 1 : 0;
                               }),
                  std::runtime_error);
     EXPECT_EQ(after, 0) << "the rest is not begun";

@@ -8,6 +8,7 @@
 
 #include "kdtree/traversal.h"
 #include "meshes.h"
+#include "rays.h"
 
 namespace espalier {
 namespace {
@@ -48,39 +49,6 @@ Tree make_flat_list(const Mesh& mesh) {
         std::fill(node.order, node.order + 8, 076543210U);
     }
     return tree;
-}
-
-std::vector<Ray> make_rays(const Mesh& mesh, uint32_t count, uint32_t seed) {
-    std::mt19937 random(seed);
-    const auto uniform = [&] { return static_cast<float>(random() >> 8) * 0x1p-24F; };
-    const Box3f box = build(mesh.soup(), {Quality::kDraft, 1}).bounds;
-    const auto point = [&] {
-        return box.lower + box.size() * Vec3f{uniform() * 2 - 0.5F, uniform() * 2 - 0.5F, uniform() * 2 - 0.5F};
-    };
-    const auto vertex = [&] {
-        const float* p = &mesh.positions[size_t{3} * (random() % (mesh.positions.size() / 3))];
-        return Vec3f{p[0], p[1], p[2]};
-    };
-    std::vector<Ray> rays;
-    for (uint32_t i = 0; i < count; ++i) {
-        const Vec3f from = point();
-        const Vec3f axis = (i & 4U) != 0 ? Vec3f{1, 0, 0} : (i & 8U) != 0 ? Vec3f{0, -1, 0} : Vec3f{-0.0F, 0, 1};
-        switch (i % 4) {
-            case 0:
-                rays.push_back({from, 0, point() - from, INFINITY});
-                break;
-            case 1:
-                rays.push_back({from, 0, vertex() - from, INFINITY});
-                break;  // at a vertex
-            case 2:
-                rays.push_back({vertex() - axis * (2 * box.size().x), 0, axis, INFINITY});
-                break;  // along an axis through a vertex
-            default:
-                rays.push_back({from, 0, (vertex() + vertex()) * 0.5F - from, INFINITY});
-                break;
-        }
-    }
-    return rays;
 }
 
 /// Whatever the tree, a ray hits what it would hit if every triangle were tested, bit for bit.

@@ -1,0 +1,102 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+#include <gtest/gtest.h>
+
+#include <cstring>
+
+#include "geometry/float_environment.h"
+#include "rays.h"
+
+namespace espalier {
+namespace {
+
+/// What a host's thread may have set: subnormals are flushed to zero, and rounding is upwards.
+class HostSettings {
+ public:
+    HostSettings() {
+#if defined(__x86_64__)
+        _mm_setcsr(0x1f80 | 0x8040 | 0x4000);
+#else
+        write(uint64_t{1} << 24 | uint64_t{1} << 22);
+#endif
+    }
+    ~HostSettings() { write(saved_); }
+    HostSettings(const HostSettings&) = delete;
+    HostSettings& operator=(const HostSettings&) = delete;
+
+    /// Without the flags that say what has been rounded.
+    static uint64_t read() {
+#if defined(__x86_64__)
+        return _mm_getcsr() & ~0x3fU;
+#else
+        uint64_t value;
+        asm volatile("mrs %0, fpcr" : "=r"(value));
+        return value;
+#endif
+    }
+    /// Whether this thread rounds upwards and flushes.
+    static bool are_felt() {
+        volatile float tiny = 0x1p-126F;
+        volatile float one = 1;
+        return tiny * 0.5F == 0 && one + 0x1p-60F > 1;
+    }
+
+ private:
+    static void write(uint64_t value) {
+#if defined(__x86_64__)
+        _mm_setcsr(static_cast<uint32_t>(value));
+#else
+        asm volatile("msr fpcr, %0" : : "r"(value) : "memory");
+#endif
+    }
+    uint64_t saved_ = read();
+};
+
+struct Answers {
+    uint64_t checksum;
+    std::vector<Hit> hits;
+    std::vector<uint8_t> blocked;
+};
+
+Answers build_and_trace(const Mesh& mesh, const std::vector<Ray>& rays, int threads) {
+    const Tree tree = build(mesh.soup(), {Quality::kBalanced, threads});
+    Answers answers{tree.report.checksum, std::vector<Hit>(rays.size()), std::vector<uint8_t>(rays.size())};
+    intersect(tree, rays, answers.hits);
+    occluded(tree, rays, answers.blocked);
+    return answers;
+}
+
+TEST(FloatEnvironment, ComesBackAfterwards) {
+    const HostSettings host;
+    const uint64_t before = HostSettings::read();
+    ASSERT_TRUE(HostSettings::are_felt());
+    {
+        const FloatEnvironment ours;
+        EXPECT_FALSE(HostSettings::are_felt());
+    }
+    EXPECT_TRUE(HostSettings::are_felt());
+    EXPECT_EQ(HostSettings::read(), before);
+}
+
+/// Coordinates of a few thousand times the smallest float, and coordinates that round at every step.
+TEST(FloatEnvironment, OfTheHostChangesNothing) {
+    Mesh subnormal = make_soup(300, 9);
+    for (float& x : subnormal.positions) {
+        x *= 0x1p-136F;
+    }
+    for (const Mesh& mesh : {subnormal, make_soup(3000, 10)}) {
+        const std::vector<Ray> rays = make_rays(mesh, 500, 3);
+        const Answers expected = build_and_trace(mesh, rays, 1);
+        for (const int threads : {1, 3}) {
+            const HostSettings host;
+            const uint64_t before = HostSettings::read();
+            const Answers answers = build_and_trace(mesh, rays, threads);
+            EXPECT_EQ(HostSettings::read(), before);
+            EXPECT_EQ(answers.checksum, expected.checksum);
+            EXPECT_EQ(std::memcmp(answers.hits.data(), expected.hits.data(), rays.size() * sizeof(Hit)), 0);
+            EXPECT_EQ(answers.blocked, expected.blocked);
+        }
+    }
+}
+
+}  // namespace
+}  // namespace espalier
