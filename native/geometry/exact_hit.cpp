@@ -33,22 +33,6 @@ Quotient exact_distance(Vec3f origin, Vec3f direction, const Vec3f (&corner)[3])
     return below.sign() < 0 ? Quotient{Expansion() - above, Expansion() - below} : Quotient{above, below};
 }
 
-/// Six times the signed volume of direction, p and q: on which side of the edge p-q the line passes.
-struct Side {
-    double value;
-    double error;
-};
-
-/// Each difference from the origin carries a relative error e = 2^-53, each product one more, each sum one more: below
-/// 8 e times the sum of the terms' absolute values, of which 16 e is taken.
-Side measure_side(Vec3d d, Vec3d p, Vec3d q) {
-    const Vec3d c{p.y * q.z - p.z * q.y, p.z * q.x - p.x * q.z, p.x * q.y - p.y * q.x};
-    const double size = std::abs(d.x) * (std::abs(p.y * q.z) + std::abs(p.z * q.y)) +
-                        std::abs(d.y) * (std::abs(p.z * q.x) + std::abs(p.x * q.z)) +
-                        std::abs(d.z) * (std::abs(p.x * q.y) + std::abs(p.y * q.x));
-    return {d.x * c.x + d.y * c.y + d.z * c.z, size * 0x1p-49};
-}
-
 Side measure_side_exactly(Vec3f origin, Vec3f direction, Vec3f p, Vec3f q) {
     const Expansion side =
         exact_dot(exact(direction), exact_cross(exact_difference(p, origin), exact_difference(q, origin)));
@@ -62,6 +46,16 @@ int largest_component(Vec3f d) {
 }
 
 }  // namespace
+
+/// Each difference from the origin carries a relative error e = 2^-53, each product one more, each sum one more: below
+/// 8 e times the sum of the terms' absolute values, of which 16 e is taken (EXACTNESS.md, 9).
+Side measure_side(Vec3d d, Vec3d p, Vec3d q) {
+    const Vec3d c{p.y * q.z - p.z * q.y, p.z * q.x - p.x * q.z, p.x * q.y - p.y * q.x};
+    const double size = std::abs(d.x) * (std::abs(p.y * q.z) + std::abs(p.z * q.y)) +
+                        std::abs(d.y) * (std::abs(p.z * q.x) + std::abs(p.x * q.z)) +
+                        std::abs(d.z) * (std::abs(p.x * q.y) + std::abs(p.y * q.x));
+    return {d.x * c.x + d.y * c.y + d.z * c.z, size * 0x1p-49};
+}
 
 bool hit_exactly(Vec3f origin, Vec3f direction, const Vec3f (&corner)[3], ExactHit& hit) {
     const Vec3d d = to_double(direction);

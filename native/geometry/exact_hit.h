@@ -16,6 +16,13 @@ struct ExactHit {
     int32_t triangle;
 };
 
+/// Six times the signed volume of direction, p and q: on which side of the edge p-q a line from the origin passes.
+struct Side {
+    double value;
+    double error;  ///< more than what the value is off by
+};
+Side measure_side(Vec3d direction, Vec3d p, Vec3d q);
+
 /// Decides as infinite precision would whether the line origin + t direction meets the closed triangle in one point; a
 /// line in the triangle's plane does not. On a hit fills in everything but `triangle`; u and v are off by at most
 /// 2^-26.

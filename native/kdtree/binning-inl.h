@@ -39,6 +39,12 @@ HWY_INLINE hn::Vec<D> slice_positions(D d, float lower, float upper, int first) 
     return hn::IfThenElse(hn::RebindMask(d, hn::Eq(plane, hn::Set(di, kSlices))), hn::Set(d, upper), between);
 }
 
+/// How far a box that is counted on one side of a plane between slices may reach beyond it: rounding of (x - lower) *
+/// scale against that of the plane's position. EXACTNESS.md, 5.
+inline float reach_beyond_slices(float lower, float upper) {
+    return (upper - lower) * 0x1p-20F + std::max(std::abs(lower), std::abs(upper)) * 0x1p-22F + 0x1p-120F;
+}
+
 /// A count that no node reaches, small enough for signed comparison.
 constexpr uint64_t kMostReferences = 0x7ffffffe;
 

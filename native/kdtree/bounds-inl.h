@@ -17,6 +17,17 @@ HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
 namespace hn = hwy::HWY_NAMESPACE;
 
+/// A component of (v1 - v0) x (v2 - v0), and more than its error: EXACTNESS.md, 3.
+template <class D, class V = hn::Vec<D>>
+HWY_INLINE void cross_component(D d, const V (&v)[3][3], int axis, V& value, V& bound) {
+    const int x = (axis + 1) % 3;
+    const int y = (axis + 2) % 3;
+    const V a = hn::Mul(hn::Sub(v[1][x], v[0][x]), hn::Sub(v[2][y], v[0][y]));
+    const V b = hn::Mul(hn::Sub(v[1][y], v[0][y]), hn::Sub(v[2][x], v[0][x]));
+    value = hn::Sub(a, b);
+    bound = hn::Add(hn::Mul(hn::Add(hn::Abs(a), hn::Abs(b)), hn::Set(d, 0x1p-21F)), hn::Set(d, 0x1p-100F));
+}
+
 /// Writes the reference of one face, or counts why it has none.
 inline void make_reference(const TriangleSoup& soup, uint32_t triangle, const References& out, uint32_t& count,
                            RejectedFaces& rejected) {
@@ -45,10 +56,6 @@ inline uint32_t make_references(const TriangleSoup& soup, uint32_t begin, uint32
     const uint32_t lanes = static_cast<uint32_t>(hn::Lanes(df));
     const auto zero = hn::Zero(df);
     const auto limit = hn::Set(df, kMaxCoordinate);
-    // |computed - exact| of a cross product component is below 4 u (|ab| + |cd|); twice that leaves no doubt.
-    const auto relative_error = hn::Set(df, 0x1p-21F);
-    const auto smallest_sure = hn::Set(df, 0x1p-100F);
-
     F lowest[3] = {hn::Inf(df), hn::Inf(df), hn::Inf(df)};
     F highest[3] = {hn::Neg(hn::Inf(df)), hn::Neg(hn::Inf(df)), hn::Neg(hn::Inf(df))};
     uint32_t count = 0;
@@ -67,12 +74,10 @@ inline uint32_t make_references(const TriangleSoup& soup, uint32_t begin, uint32
         }
         auto has_area = hn::Lt(zero, zero);
         for (int axis = 0; axis < 3; ++axis) {
-            const int x = (axis + 1) % 3;
-            const int y = (axis + 2) % 3;
-            const auto a = hn::Mul(hn::Sub(v[1][x], v[0][x]), hn::Sub(v[2][y], v[0][y]));
-            const auto b = hn::Mul(hn::Sub(v[1][y], v[0][y]), hn::Sub(v[2][x], v[0][x]));
-            const auto bound = hn::Add(hn::Mul(hn::Add(hn::Abs(a), hn::Abs(b)), relative_error), smallest_sure);
-            has_area = hn::Or(has_area, hn::Gt(hn::Abs(hn::Sub(a, b)), bound));
+            F value;
+            F bound;
+            cross_component(df, v, axis, value, bound);
+            has_area = hn::Or(has_area, hn::Gt(hn::Abs(value), bound));
         }
         if (!hn::AllTrue(df, hn::And(valid, has_area))) {
             for (uint32_t lane = 0; lane < lanes; ++lane) {

@@ -78,9 +78,7 @@ class SmallNode {
         float* positions = positions_[axis];
         auto& left = left_[axis];
         auto& right = right_[axis];
-        // How far a reference that is counted on one side of a plane may reach beyond it: rounding of (x - lower) *
-        // scale against that of the plane's position.
-        reach_[axis] = (upper - lower) * 0x1p-20F + std::max(std::abs(lower), std::abs(upper)) * 0x1p-22F + 0x1p-120F;
+        reach_[axis] = reach_beyond_slices(lower, upper);
         if (slices.scale == 0) {
             std::fill(positions, positions + kPlanes, std::numeric_limits<float>::infinity());  // never inside the cell
             std::memset(left, 0, sizeof left);

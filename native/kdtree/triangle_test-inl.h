@@ -73,6 +73,36 @@ class BlockLoader {
     [[maybe_unused]] const float* second_;
 };
 
+/// Triangles as the ray sees them, along +z through the origin, and their edge functions: the weights of the corners.
+template <class V>
+struct Sheared {
+    V x[3];
+    V y[3];
+    V z[3];
+    V u, v, w;
+
+    /// load(k, axis): the coordinates of corner k, `axis` as in TracedRay.
+    template <class D, class Load>
+    HWY_INLINE Sheared(D d, const TracedRay& ray, const Load& load) {
+        for (size_t k = 0; k < 3; ++k) {
+            z[k] = hn::Sub(load(k, ray.z), hn::Set(d, ray.oz));
+            x[k] = hn::NegMulAdd(hn::Set(d, ray.sx), z[k], hn::Sub(load(k, ray.x), hn::Set(d, ray.ox)));
+            y[k] = hn::NegMulAdd(hn::Set(d, ray.sy), z[k], hn::Sub(load(k, ray.y), hn::Set(d, ray.oy)));
+        }
+        u = hn::MulSub(x[2], y[1], hn::Mul(y[2], x[1]));
+        v = hn::MulSub(x[0], y[2], hn::Mul(y[0], x[2]));
+        w = hn::MulSub(x[1], y[0], hn::Mul(y[1], x[0]));
+    }
+};
+
+/// Less than minus the error of any of the three edge functions; mz: the largest |z| of the corners. EXACTNESS.md, 8.
+template <class D, class V = hn::Vec<D>>
+HWY_INLINE V minus_edge_error(D d, const Sheared<V>& seen, V mz) {
+    const V s = hn::MulAdd(hn::Set(d, 5.5F * 0x1p-24F), mz, hn::Add(largest_of(seen.x), largest_of(seen.y)));
+    return hn::MulAdd(s, hn::MulAdd(hn::Set(d, -10.5F * 0x1p-24F), mz, hn::Mul(hn::Set(d, -3.25F * 0x1p-24F), s)),
+                      hn::Set(d, -kTiny));
+}
+
 /// The lanes of a block, and of the one behind it where a step takes two, that the ray may hit within [start, reach];
 /// every lane that it does hit is among them.
 ///
@@ -97,28 +127,18 @@ HWY_INLINE uint32_t test_blocks(const TracedRay& ray, const TriangleBlock* block
     const BlockLoader load(block, is_single);
     uint32_t possible = 0;
     for (size_t first = 0; first < kBlockSize; first += kLanes) {
-        V x[3];
-        V y[3];
-        V z[3];
-        for (size_t k = 0; k < 3; ++k) {
-            const size_t corner = k * 3 * kBlockSize + first;
-            z[k] = hn::Sub(load(corner + ray.z), hn::Set(d, ray.oz));
-            x[k] = hn::NegMulAdd(hn::Set(d, ray.sx), z[k], hn::Sub(load(corner + ray.x), hn::Set(d, ray.ox)));
-            y[k] = hn::NegMulAdd(hn::Set(d, ray.sy), z[k], hn::Sub(load(corner + ray.y), hn::Set(d, ray.oy)));
-        }
-        const V u = hn::MulSub(x[2], y[1], hn::Mul(y[2], x[1]));
-        const V v = hn::MulSub(x[0], y[2], hn::Mul(y[0], x[2]));
-        const V w = hn::MulSub(x[1], y[0], hn::Mul(y[1], x[0]));
+        const Sheared<V> seen(d, ray, [&](size_t k, uint32_t axis) { return load(k * 3 * kBlockSize + first + axis); });
+        const V u = seen.u;
+        const V v = seen.v;
+        const V w = seen.w;
+        const V(&z)[3] = seen.z;
         // How far the least convincing of the three lies inside. Lanes without a triangle are NaN and fail.
         const V inwards = hn::Max(hn::Min(u, hn::Min(v, w)), hn::Neg(hn::Max(u, hn::Max(v, w))));
         V below = hn::Zero(d);  // -bound
         V mz = below;
         if constexpr (kExact) {
             mz = largest_of(z);
-            const V s = hn::MulAdd(hn::Set(d, 5.5F * 0x1p-24F), mz, hn::Add(largest_of(x), largest_of(y)));
-            below =
-                hn::MulAdd(s, hn::MulAdd(hn::Set(d, -10.5F * 0x1p-24F), mz, hn::Mul(hn::Set(d, -3.25F * 0x1p-24F), s)),
-                           hn::Set(d, -kTiny));
+            below = minus_edge_error(d, seen, mz);
         }
         const auto inside = hn::Ge(inwards, below);
         if (hn::AllFalse(d, inside)) {

@@ -1,0 +1,416 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+// The tracer's inequalities of native/EXACTNESS.md, measured as in test_build_bounds.cpp.
+#include <gtest/gtest.h>
+
+#include "exact_kit.h"
+#include "geometry/exact_hit.h"
+#include "geometry/expansion.h"
+#include "kdtree/simd_config.h"
+
+#undef HWY_TARGET_INCLUDE
+#define HWY_TARGET_INCLUDE "test_trace_bounds.cpp"
+#include <hwy/foreach_target.h>
+// Highway's own header has to follow foreach_target.h.
+#include <hwy/highway.h>
+
+#include "kdtree/finish-inl.h"
+#include "kdtree/triangle_test-inl.h"
+
+#ifndef ESPALIER_TEST_TRACE_BOUNDS_TYPES
+#define ESPALIER_TEST_TRACE_BOUNDS_TYPES
+namespace espalier {
+
+/// What the code under test computes for one case.
+struct DepthsResult {
+    float near[3], far[3];              ///< of the planes of a box
+    float near_shift[3], far_shift[3];  ///< per axis
+    float entry, exit;                  ///< of the box
+};
+struct FilterResult {
+    float u, v, w, bound;
+    bool possible, certain;
+    float lower, upper;
+};
+struct FinishResult {
+    bool open;
+    float t, u, v;
+};
+
+}  // namespace espalier
+#endif
+
+HWY_BEFORE_NAMESPACE();
+namespace espalier::HWY_NAMESPACE {
+namespace hn = hwy::HWY_NAMESPACE;
+
+inline DepthsResult depths_of(const Ray& ray, float extent, const Box3f& box) {
+    const hn::CappedTag<float, 4> d;
+    TracedRay traced;
+    traced.start_from(ray, extent);
+    DepthsResult result;
+    result.entry = traced.start;
+    result.exit = traced.reach;
+    for (int axis = 0; axis < 3; ++axis) {
+        const bool negative = (traced.octant >> axis & 1U) != 0;
+        const auto depth = [&](float plane, float shift) {
+            return hn::GetLane(hn::MulAdd(hn::Set(d, plane), hn::Set(d, traced.inverse[axis]), hn::Set(d, shift)));
+        };
+        result.near_shift[axis] = traced.near_shift[axis];
+        result.far_shift[axis] = traced.far_shift[axis];
+        result.near[axis] = depth(negative ? box.upper[axis] : box.lower[axis], traced.near_shift[axis]);
+        result.far[axis] = depth(negative ? box.lower[axis] : box.upper[axis], traced.far_shift[axis]);
+        result.entry = std::max(result.entry, result.near[axis]);
+        result.exit = std::min(result.exit, result.far[axis]);
+    }
+    return result;
+}
+
+inline FilterResult filter(const Ray& ray, const Vec3f (&corner)[3]) {
+    TriangleBlock block;
+    for (uint32_t lane = 0; lane < kBlockSize; ++lane) {
+        block.triangle[lane] = lane;
+        for (int k = 0; k < 3; ++k) {
+            for (int axis = 0; axis < 3; ++axis) {
+                block.vertex[k][axis][lane] = corner[k][axis];
+            }
+        }
+    }
+    TracedRay traced;
+    traced.start_from(ray, kMaxCoordinate);
+    const hn::CappedTag<float, kBlockSize> d;
+    using V = hn::Vec<decltype(d)>;
+    const Sheared<V> seen(d, traced, [&](size_t k, uint32_t axis) { return hn::Load(d, block.vertex[k][0] + axis); });
+    const V bound = hn::Neg(minus_edge_error(d, seen, largest_of(seen.z)));
+    Verdict verdict{};
+    const uint32_t possible = test_blocks<true>(traced, &block, true, verdict);
+    return {hn::GetLane(seen.u), hn::GetLane(seen.v),  hn::GetLane(seen.w),
+            hn::GetLane(bound),  (possible & 1U) != 0, (possible & verdict.certain & 1U) != 0,
+            verdict.lower[0],    verdict.upper[0]};
+}
+
+inline FinishResult finish(const Ray& ray, const Vec3f (&corner)[3]) {
+    FinishBatch batch;
+    for (size_t lane = 0; lane < FinishBatch::kSize; ++lane) {
+        for (int axis = 0; axis < 3; ++axis) {
+            const auto a = static_cast<size_t>(axis);
+            batch.origin[a][lane] = ray.origin[axis];
+            batch.direction[a][lane] = ray.direction[axis];
+            for (size_t k = 0; k < 3; ++k) {
+                batch.corner[k][a][lane] = corner[k][axis];
+            }
+        }
+    }
+    const bool open = (finish_in_double(batch) & 1U) != 0;
+    return {open, batch.t[0], batch.u[0], batch.v[0]};
+}
+
+}  // namespace espalier::HWY_NAMESPACE
+HWY_AFTER_NAMESPACE();
+
+#if HWY_ONCE
+namespace espalier {
+namespace {
+
+struct Code {
+    const char* name;
+    DepthsResult (*depths_of)(const Ray&, float, const Box3f&);
+    FilterResult (*filter)(const Ray&, const Vec3f (&)[3]);
+    FinishResult (*finish)(const Ray&, const Vec3f (&)[3]);
+};
+
+std::vector<Code> code_under_test() {
+#define ESPALIER_CODE(name, set)                       \
+    {                                                  \
+        name, set::depths_of, set::filter, set::finish \
+    }
+    return runnable<Code>({
+#if defined(__x86_64__)
+        ESPALIER_CODE("sse4", N_SSE4), ESPALIER_CODE("avx2", N_AVX2), ESPALIER_CODE("avx512", N_AVX3_DL)
+#else
+        ESPALIER_CODE("neon", N_NEON)
+#endif
+    });
+#undef ESPALIER_CODE
+}
+
+class TraceBounds : public testing::TestWithParam<Code> {
+ protected:
+    static std::string named(const std::string& what) { return std::string(GetParam().name) + ": " + what; }
+};
+
+constexpr double kU = 0x1p-24;
+
+/// A ray that comes near a triangle: aimed at a point of it, at an edge as often as not, and how far in float allows.
+struct Aimed {
+    Ray ray;
+    Vec3f corner[3];
+};
+
+Aimed aim(Random& random, int low, int high) {
+    Aimed aimed;
+    const Vec3f base = random.point(low, high);
+    const int shrink = static_cast<int>(random.below(16));
+    for (Vec3f& corner : aimed.corner) {
+        const Vec3f offset = random.point(low, high);
+        corner = base + offset * std::ldexp(1.0F, -shrink);
+    }
+    aimed.ray.origin = random.point(low, high);
+    double weight[3] = {random.fraction(), random.fraction(), random.below(2) == 0 ? 0.0 : random.fraction()};
+    const double sum = weight[0] + weight[1] + weight[2] + 0x1p-60;
+    const uint32_t first = random.below(3);
+    Vec3d target;
+    for (uint32_t k = 0; k < 3; ++k) {
+        target += to_double(aimed.corner[(first + k) % 3]) * (weight[k] / sum);
+    }
+    Vec3d d = target - to_double(aimed.ray.origin);
+    const double largest = std::max({std::abs(d.x), std::abs(d.y), std::abs(d.z)});
+    d = d * std::ldexp(1.0, -std::ilogb(largest));
+    aimed.ray.direction = to_float(d * static_cast<double>(random.mantissa()));
+    aimed.ray.t_min = 0;
+    aimed.ray.t_max = HUGE_VALF;
+    return aimed;
+}
+
+int largest_axis(Vec3f d) {
+    const Vec3f a{std::abs(d.x), std::abs(d.y), std::abs(d.z)};
+    return a.x > a.y ? (a.x > a.z ? 0 : 2) : (a.y > a.z ? 1 : 2);
+}
+
+/// The weights of the corners by Pluecker coordinates, and the distance: t = above / below.
+struct ExactTriangle {
+    Exact weight[3];
+    Exact below;
+    Exact above;
+
+    ExactTriangle(const Ray& ray, const Vec3f (&corner)[3]) {
+        const ExactVec d = exact(ray.direction);
+        ExactVec p[3];
+        for (int k = 0; k < 3; ++k) {
+            p[k] = minus(exact(corner[k]), exact(ray.origin));
+        }
+        for (int k = 0; k < 3; ++k) {
+            weight[k] = dot(d, cross(p[(k + 1) % 3], p[(k + 2) % 3]));
+            below += weight[k];
+        }
+        above = dot(p[0], cross(p[1], p[2]));
+    }
+    bool is_hit() const {
+        return below != 0 && sgn(weight[0]) * sgn(below) >= 0 && sgn(weight[1]) * sgn(below) >= 0 &&
+               sgn(weight[2]) * sgn(below) >= 0;
+    }
+    Exact t() const { return above / below; }
+};
+
+/// Boxes as thin as floats allow around a point of a ray.
+TEST_P(TraceBounds, OfTheBoxTestLetNoPointSlip) {
+    Random random(4);
+    Share share(named("depth of a box's plane, 6"));
+    Share room(named("entry beyond exit, 6"));
+    uint32_t slipped = 0;
+    uint32_t would_slip = 0;
+    for (const auto& [low, high] : kRanges) {
+        for (int i = 0; i < 6000; ++i) {
+            Ray ray{random.point(low, high), 0, random.point(-3, 0), HUGE_VALF};
+            if (i % 3 != 0) {  // nearly, or just, along an axis or in a plane
+                for (int n = i % 3; n != 0; --n) {
+                    const int axis = static_cast<int>(random.below(3));
+                    const float tiny = std::ldexp(random.mantissa(), -static_cast<int>(random.below(40)));
+                    const float values[] = {0.0F, -0.0F, tiny, -tiny, tiny * 0x1p-100F};
+                    float* component = axis == 0 ? &ray.direction.x : axis == 1 ? &ray.direction.y : &ray.direction.z;
+                    *component = values[random.below(5)];
+                }
+            }
+            const int kz = largest_axis(ray.direction);
+            const float largest = std::abs(ray.direction[kz]);
+            if (largest < 0x1p-100F) {
+                continue;
+            }
+            const ExactVec d = exact(ray.direction);
+            const Exact depth = Exact(std::abs(random.number(low, high)));
+            Box3f box;
+            float extent = 0;
+            for (int axis = 0; axis < 3; ++axis) {
+                const Exact at =
+                    exact(ray.origin)[static_cast<size_t>(axis)] + d[static_cast<size_t>(axis)] / largest * depth;
+                float lower = static_cast<float>(at.get_d());
+                lower = Exact(lower) > at ? std::nextafter(lower, -HUGE_VALF) : lower;
+                box.lower[axis] = lower;
+                box.upper[axis] = Exact(lower) == at ? lower : std::nextafter(lower, HUGE_VALF);
+                extent = std::max({extent, std::abs(box.lower[axis]), std::abs(box.upper[axis])});
+            }
+            if (extent > kMaxCoordinate) {
+                continue;
+            }
+            const DepthsResult result = GetParam().depths_of(ray, extent, box);
+            slipped += result.entry <= result.exit * (1 + 0x1p-21F) ? 0U : 1U;
+            if (result.exit > 0 && result.entry > result.exit) {
+                room.add(Exact(result.entry) - result.exit, Exact(result.exit) * Exact(0x1p-21));
+            }
+            Exact entry = 0;
+            Exact exit = Exact(0x1p100);
+            for (int axis = 0; axis < 3; ++axis) {
+                const Exact margin = (Exact(result.far_shift[axis]) - result.near_shift[axis]) / 2;
+                if (size_of(d[static_cast<size_t>(axis)]) >= Exact(largest) * Exact(0x1p-25)) {
+                    const bool negative = ray.direction[axis] < 0;
+                    const auto check = [&](float plane, const Exact& centred) {
+                        const Exact plane_depth =
+                            (Exact(plane) - ray.origin[axis]) / d[static_cast<size_t>(axis)] * largest;
+                        share.add(centred - plane_depth, margin + Exact(2.1 * kU) * size_of(plane_depth));
+                    };
+                    check(negative ? box.upper[axis] : box.lower[axis], result.near[axis] + margin);
+                    check(negative ? box.lower[axis] : box.upper[axis], result.far[axis] - margin);
+                }
+                entry = std::max<Exact>(entry, result.near[axis] + margin);
+                exit = std::min<Exact>(exit, result.far[axis] - margin);
+            }
+            would_slip += entry > exit ? 1U : 0U;
+        }
+    }
+    EXPECT_EQ(slipped, 0U);
+    EXPECT_GT(would_slip, 100U) << "without margins rays would slip through: the cases are hard ones";
+    EXPECT_LT(share.largest(), 1);
+    EXPECT_GT(share.largest(), 0.2);
+    EXPECT_LT(room.largest(), 1);
+}
+
+TEST_P(TraceBounds, OfTheFloatFilterHoldWhatItDoesNotDecide) {
+    Random random(5);
+    Share edges(named("edge functions, 8"));
+    Share depths(named("depth of a hit, 8"));
+    uint32_t lost = 0;
+    uint32_t invented = 0;
+    uint32_t undecided = 0;
+    uint32_t decided = 0;
+    for (const auto& [low, high] : kRanges) {
+        for (int i = 0; i < 5000; ++i) {
+            const Aimed aimed = aim(random, low, high);
+            const Ray& ray = aimed.ray;
+            if (!has_area(aimed.corner)) {
+                continue;
+            }
+            const FilterResult result = GetParam().filter(ray, aimed.corner);
+            const ExactTriangle truth(ray, aimed.corner);
+            // Sheared, edge functions are the weights over the direction's largest component.
+            const int kz = largest_axis(ray.direction);
+            const Exact along = ray.direction[kz];
+            const float computed[] = {result.u, result.v, result.w};
+            for (int k = 0; k < 3; ++k) {
+                edges.add(computed[k] + truth.weight[k] / along, result.bound);
+            }
+            const bool counts = truth.is_hit() && truth.t() >= 0;
+            lost += counts && !result.possible ? 1U : 0U;
+            invented += result.certain && !truth.is_hit() ? 1U : 0U;
+            decided += result.certain ? 1U : 0U;
+            undecided += result.possible && !result.certain ? 1U : 0U;
+            if (counts && result.possible && std::isfinite(result.upper)) {
+                const Exact middle = (Exact(result.lower) + result.upper) / 2;
+                depths.add(truth.t() * size_of(along) - middle, (Exact(result.upper) - result.lower) / 2);
+            }
+        }
+    }
+    EXPECT_EQ(lost, 0U);
+    EXPECT_EQ(invented, 0U);
+    EXPECT_GT(undecided, 1000U);
+    EXPECT_GT(decided, 1000U);
+    EXPECT_LT(edges.largest(), 1);
+    EXPECT_GT(edges.largest(), 0.1);
+    EXPECT_LT(depths.largest(), 1);
+    EXPECT_GT(depths.largest(), 0.03);
+}
+
+TEST_P(TraceBounds, OfTheFinishAreKept) {
+    Random random(6);
+    Share distance(named("t in ulps, 12"));
+    Share place(named("u and v over 2^-24.5, 12"));
+    uint32_t finished = 0;
+    for (const auto& [low, high] : kRanges) {
+        for (int i = 0; i < 5000; ++i) {
+            const Aimed aimed = aim(random, low, high);
+            const ExactTriangle truth(aimed.ray, aimed.corner);
+            const FinishResult result = GetParam().finish(aimed.ray, aimed.corner);
+            if (result.open || !truth.is_hit()) {
+                continue;
+            }
+            ++finished;
+            const Exact t = truth.t();
+            const int exponent = t == 0 ? -126 : std::max(std::ilogb(size_of(t).get_d()), -126);
+            distance.add(Exact(result.t) - t, Exact(std::ldexp(1.0, exponent - 23)));
+            place.add(Exact(result.u) - truth.weight[1] / truth.below, Exact(std::exp2(-24.5)));
+            place.add(Exact(result.v) - truth.weight[2] / truth.below, Exact(std::exp2(-24.5)));
+        }
+    }
+    EXPECT_GT(finished, 3000U);
+    EXPECT_LT(distance.largest(), 0.5626);
+    EXPECT_GT(distance.largest(), 0.4);
+    EXPECT_LT(place.largest(), 1);
+}
+
+INSTANTIATE_TEST_SUITE_P(OnEachSet, TraceBounds, testing::ValuesIn(code_under_test()),
+                         [](const auto& code) { return std::string(code.param.name); });
+
+TEST(DoubleBounds, OfSidesAndDistances) {
+    Random random(7);
+    Share side_share("sides in double, 9");
+    Share distance_share("distance in double, 9");
+    Share place_share("u and v over 2^-26, 9");
+    Share estimate_share("estimate of an expansion, 10");
+    uint32_t different = 0;
+    uint32_t open = 0;
+    for (const auto& [low, high] : kRanges) {
+        for (int i = 0; i < 6000; ++i) {
+            const Aimed aimed = aim(random, low, high);
+            if (!has_area(aimed.corner)) {
+                continue;
+            }
+            const Ray& ray = aimed.ray;
+            const ExactTriangle truth(ray, aimed.corner);
+            Vec3d p[3];
+            for (int k = 0; k < 3; ++k) {
+                p[k] = to_double(aimed.corner[k]) - to_double(ray.origin);
+            }
+            for (int k = 0; k < 3; ++k) {
+                const Side side = measure_side(to_double(ray.direction), p[(k + 1) % 3], p[(k + 2) % 3]);
+                side_share.add(side.value - truth.weight[k], side.error);
+                open += std::abs(side.value) <= side.error ? 1U : 0U;
+            }
+            ExactHit hit;
+            const bool is_hit = hit_exactly(ray.origin, ray.direction, aimed.corner, hit);
+            different += is_hit != truth.is_hit() ? 1U : 0U;
+            if (!is_hit) {
+                continue;
+            }
+            distance_share.add(hit.t - truth.t(), hit.error);
+            place_share.add(hit.u - truth.weight[1] / truth.below, Exact(0x1p-26));
+            place_share.add(hit.v - truth.weight[2] / truth.below, Exact(0x1p-26));
+        }
+    }
+    EXPECT_EQ(different, 0U);
+    EXPECT_LT(side_share.largest(), 1);
+    EXPECT_GT(side_share.largest(), 0.05);
+    EXPECT_LT(distance_share.largest(), 1);
+    EXPECT_GT(distance_share.largest(), 0.02);
+    EXPECT_LT(place_share.largest(), 1);
+
+    // Many parts whose sum nearly cancels.
+    for (int i = 0; i < 20000; ++i) {
+        Expansion sum;
+        Exact truth = 0;
+        for (int n = 0; n < 12; ++n) {
+            const Vec3f f = random.point(-40, 20);
+            const Vec3f g = n % 3 == 2 ? f : random.point(-40, 20);
+            const Expansion product = Expansion::difference(f.x, g.y) * Expansion::difference(g.x, f.y);
+            sum = n % 2 == 0 ? sum + product : sum - product;
+            truth += (n % 2 == 0 ? 1 : -1) * ((Exact(f.x) - g.y) * (Exact(g.x) - f.y));
+        }
+        EXPECT_EQ(sum.sign(), sgn(truth));
+        if (truth != 0) {
+            estimate_share.add(sum.estimate() - truth, size_of(truth) * Exact(0x1p-51));
+        }
+    }
+    EXPECT_LT(estimate_share.largest(), 1);
+    EXPECT_GT(estimate_share.largest(), 0.1);
+}
+
+}  // namespace
+}  // namespace espalier
+#endif
