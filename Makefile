@@ -51,7 +51,7 @@ long-run: test-native native
 	python -m tests.exactness $(RAYS)
 
 test-neon: python
-	@tools/need libgtest-dev g++-aarch64-linux-gnu qemu-user googletest
+	@tools/need $(TEST_SYSTEM) g++-aarch64-linux-gnu qemu-user googletest
 	cmake --preset release
 	cmake --build --preset release -j $(JOBS) --target espalier_fingerprint
 	cmake --preset neon -Wno-deprecated
