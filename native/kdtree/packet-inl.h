@@ -45,7 +45,8 @@ class Packet {
             const Vec3f end = first.origin + first.direction;
             const Vec3f off = last.origin + last.direction - end;
             const float size = std::abs(end.x) + std::abs(end.y) + std::abs(end.z);
-            if (std::abs(off.x) + std::abs(off.y) + std::abs(off.z) <= size * 0x1p-20F) {
+            // Seen from farther away than any triangle may lie, products would overflow.
+            if (size <= kMaxCoordinate && std::abs(off.x) + std::abs(off.y) + std::abs(off.z) <= size * 0x1p-20F) {
                 return to_focus(end);
             }
         }
@@ -394,9 +395,10 @@ class Packet {
     /// With u = 2^-24, slopes that are off by at most 2 u, h = the sum of both spreads and g = h mz: to the error of an
     /// edge function in the middle, u (12 mx my + 10 mz (mx + my)) + 50 u^2 mz^2 as in test_blocks, come what the
     /// slopes' errors do, 4 u mz (mx + my); what those of n.x and n.y do, each below u (8 mz^2 + 14 mz m) for m = mx or
-    /// my, so together u g (8 mz + 14 m); and the roundings of the two last sums, below 4 u g m. With s = mx + my + g +
-    /// 5.5 u mz all that is below u s (9.1 s + 14.1 mz). Lines that miss the focus by up to `deviation` change an edge
-    /// function by no more than 2 deviation s, once the shear has added its z to its x and y.
+    /// my, so together u g (8 mz + 14 m); and the roundings of the last products and sums, below u (4 mx my + 6 g m).
+    /// With s = mx + my + g + 5.5 u mz all that is below u s (9.1 s + 14.1 mz). Lines that miss the focus by up to
+    /// `deviation` change an edge function by no more than 2 deviation s, once the shear has added its z to its x and
+    /// y.
     HWY_INLINE void visit_blocks(uint32_t index, bool is_single) {
         const hn::CappedTag<float, View::kSize> d8;
         constexpr size_t kHere = hn::MaxLanes(hn::CappedTag<float, View::kSize>());
