@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// Sixteen rays on one way through the tree, where all of them start or all of them end in the same point: rays of a
+// Many rays on one way through the tree, where all of them start or all of them end in the same point: rays of a
 // camera, or of a lamp. Compiled once per instruction set (see traversal.cpp).
 
 #if defined(ESPALIER_KDTREE_PACKET_INL_H_) == defined(HWY_TARGET_TOGGLE)
@@ -28,7 +28,7 @@ namespace hn = hwy::HWY_NAMESPACE;
 template <bool kAnyHit, bool kExact>
 class Packet {
  public:
-    static constexpr size_t kRays = 16;
+    static constexpr size_t kRays = 2 * hn::MaxLanes(hn::CappedTag<float, 16>());
 
     explicit Packet(const Tree& tree)
         : nodes_(tree.wide_nodes.data()), blocks_(tree.blocks.data()), extent_(extent_of(tree)) {}
@@ -86,7 +86,7 @@ class Packet {
     uint32_t place(size_t lane) const { return place_[lane]; }
 
  private:
-    using D = hn::CappedTag<float, kRays>;
+    using D = hn::CappedTag<float, 16>;
     using V = hn::Vec<D>;
     static constexpr D d{};
     static constexpr hn::RebindToUnsigned<D> du{};
@@ -326,9 +326,7 @@ class Packet {
                 hn::TableLookupLanes(hn::IfThenElse(meets, entry, hn::Inf(d8)), hn::IndicesFromVec(d8, slots));
             const auto pushed = hn::Lt(depth, hn::Inf(d8));
             const auto place = hn::Add(slots, hn::Set(du8, index * WideNode::kWidth));
-            hn::StoreU(hn::Compress(place, hn::RebindMask(du8, pushed)), du8, places_ + stacked);
-            hn::StoreU(hn::Compress(depth, pushed), d8, depths_ + stacked);
-            return hn::CountTrue(d8, pushed);
+            return compress_pair(d8, pushed, place, places_ + stacked, depth, depths_ + stacked);
         }
 #else
             hn::Store(entry, d8, entries + first);
@@ -463,41 +461,63 @@ class Packet {
         if (is_single) {
             reached &= (1U << kBlockSize) - 1;
         }
-        bool taken = false;
+        // First which of them some ray meets, without a branch for each: those are hard to foresee.
+        uint32_t met[View::kSize];
+        size_t count = 0;
         for (; reached != 0; reached &= reached - 1) {
             const auto lane = static_cast<uint32_t>(std::countr_zero(reached));
-            taken |= test_from_focus(view, lane, index * kBlockSize + lane);
+            met[count] = lane;
+            count += any_meets(view, lane) ? 1 : 0;
+        }
+        bool taken = false;
+        for (size_t i = 0; i < count; ++i) {
+            taken |= test_from_focus(view, met[i], index * kBlockSize + met[i]);
         }
         if (taken) {
             update_reach();
         }
     }
 
+    HWY_INLINE void sides_from_focus(const View& view, uint32_t triangle, size_t lane, V (&side)[3]) const {
+        const V off_x = hn::Load(d, off_x_ + lane);
+        const V off_y = hn::Load(d, off_y_ + lane);
+        for (size_t e = 0; e < 3; ++e) {
+            side[e] = hn::NegMulAdd(
+                off_x, hn::Set(d, view.normal[e][0][triangle]),
+                hn::NegMulAdd(off_y, hn::Set(d, view.normal[e][1][triangle]), hn::Set(d, view.normal[e][2][triangle])));
+        }
+    }
+
+    HWY_INLINE hn::Mask<D> may_meet(const V (&side)[3], V bound, size_t lane) const {
+        const auto inside = hn::Ge(depth_inside(side), hn::Neg(bound));
+        return kAnyHit ? hn::And(inside, hn::Ge(hn::Load(d, reaches_ + lane), hn::Zero(d))) : inside;
+    }
+
+    HWY_INLINE bool any_meets(const View& view, uint32_t triangle) const {
+        uint32_t meets = 0;
+        for (size_t lane = 0; lane < kRays; lane += kLanes) {
+            V side[3];
+            sides_from_focus(view, triangle, lane, side);
+            meets |= mask_bits(d, may_meet(side, hn::Set(d, view.bound[triangle]), lane));
+        }
+        return meets != 0;
+    }
+
     HWY_INLINE bool test_from_focus(const View& view, uint32_t triangle, uint32_t place) {
         bool taken = false;
-        const V bound = hn::Set(d, view.bound[triangle]);
         for (size_t lane = 0; lane < kRays; lane += kLanes) {
-            const V off_x = hn::Load(d, off_x_ + lane);
-            const V off_y = hn::Load(d, off_y_ + lane);
-            V side[3];
-            for (size_t e = 0; e < 3; ++e) {
-                side[e] = hn::NegMulAdd(off_x, hn::Set(d, view.normal[e][0][triangle]),
-                                        hn::NegMulAdd(off_y, hn::Set(d, view.normal[e][1][triangle]),
-                                                      hn::Set(d, view.normal[e][2][triangle])));
-            }
-            const V inwards = depth_inside(side);
-            auto inside = hn::Ge(inwards, hn::Neg(bound));
-            if constexpr (kAnyHit) {
-                inside = hn::And(inside, hn::Ge(hn::Load(d, reaches_ + lane), hn::Zero(d)));
-            }
-            if (hn::AllFalse(d, inside)) {
-                continue;
-            }
             if (kAnyHit && is_reversed_) {
                 taken |= test_from_origins(lane, place);
                 continue;
             }
-            taken |= take(lane, side, inwards, inside, bound, hn::Set(d, view.size[triangle]),
+            V side[3];
+            sides_from_focus(view, triangle, lane, side);
+            const V bound = hn::Set(d, view.bound[triangle]);
+            const auto inside = may_meet(side, bound, lane);
+            if (kLanes != kRays && hn::AllFalse(d, inside)) {
+                continue;
+            }
+            taken |= take(lane, side, depth_inside(side), inside, bound, hn::Set(d, view.size[triangle]),
                           hn::Set(d, view.z[0][triangle]), hn::Set(d, view.z[1][triangle]),
                           hn::Set(d, view.z[2][triangle]), sign_, place);
         }

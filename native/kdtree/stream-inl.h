@@ -58,9 +58,7 @@ struct StreamRay : TracedRay {
             const auto child = hn::LoadU(du, children + i);
             // The last vector runs over the end: what lies there counts for nothing.
             const auto keep = hn::And(hn::Le(entry, limit), hn::FirstN(d, count - i));
-            hn::StoreU(hn::Compress(child, hn::RebindMask(du, keep)), du, children + kept);
-            hn::StoreU(hn::Compress(entry, keep), d, depths + kept);
-            kept += hn::CountTrue(d, keep);
+            kept += compress_pair(d, keep, child, children + kept, entry, depths + kept);
         }
         top = children + kept;
     }
@@ -95,10 +93,7 @@ HWY_INLINE void visit_node(StreamRay& ray, const WideNode& node) {
         const auto child = hn::BitCast(du, hn::TableLookupLanes(hn::BitCast(d, hn::Load(du, node.child)), order));
         const auto depth = hn::TableLookupLanes(hn::IfThenElse(meets, entry, hn::Inf(d)), order);
         const auto stacked = hn::Lt(depth, hn::Inf(d));
-        uint32_t* top = ray.top;
-        hn::StoreU(hn::Compress(child, hn::RebindMask(du, stacked)), du, top);
-        hn::StoreU(hn::Compress(depth, stacked), d, ray.top_depth());
-        ray.top = top + hn::CountTrue(d, stacked);
+        ray.top += compress_pair(d, stacked, child, ray.top, depth, ray.top_depth());
     }
 #else
         hn::Store(entry, d, entries + first);

@@ -11,6 +11,7 @@
 #include <hwy/highway.h>
 
 #include <algorithm>
+#include <bit>
 #include <cmath>
 #include <cstdint>
 #include <limits>
@@ -29,6 +30,53 @@ constexpr float kInfinity = std::numeric_limits<float>::infinity();
 /// processors more than a hundred cycles an operation.
 constexpr float kTiny = 0x1p-120F;
 
+template <class D, class M>
+HWY_INLINE uint32_t mask_bits(D d, M mask) {
+    uint8_t bits[8] = {};
+    hn::StoreMaskBits(d, mask, bits);
+    return bits[0] | uint32_t{bits[1]} << 8;
+}
+
+#if HWY_TARGET == HWY_AVX2
+/// Per mask of eight lanes the numbers of its set lanes in order, 4 bits each. Highway has such a table too, but copies
+/// it onto the stack at each use.
+struct CompressTable {
+    uint32_t lanes[256];
+    constexpr CompressTable() : lanes() {
+        for (uint32_t mask = 0; mask < 256; ++mask) {
+            uint32_t shift = 0;
+            for (uint32_t lane = 0; lane < 8; ++lane) {
+                if ((mask >> lane & 1U) != 0) {
+                    lanes[mask] |= lane << shift;
+                    shift += 4;
+                }
+            }
+        }
+    }
+};
+inline constexpr CompressTable kCompressTable;
+#endif
+
+/// Stores those lanes of two vectors that a mask selects, without gaps; what lies behind them is overwritten. Returns
+/// their number.
+template <class D>
+HWY_INLINE size_t compress_pair(D d, hn::Mask<D> mask, hn::Vec<hn::RebindToUnsigned<D>> a, uint32_t* to_a, hn::Vec<D> b,
+                                float* to_b) {
+    const hn::RebindToUnsigned<D> du;
+#if HWY_TARGET == HWY_AVX2
+    const uint32_t bits = mask_bits(d, mask);
+    const auto packed = hn::Set(du, kCompressTable.lanes[bits]);
+    const auto lanes = hn::And(hn::Shr(packed, hn::Mul(hn::Iota(du, 0), hn::Set(du, 4))), hn::Set(du, 7));
+    hn::StoreU(hn::TableLookupLanes(a, hn::IndicesFromVec(du, lanes)), du, to_a);
+    hn::StoreU(hn::TableLookupLanes(b, hn::IndicesFromVec(d, lanes)), d, to_b);
+    return static_cast<size_t>(std::popcount(bits));
+#else
+    hn::StoreU(hn::Compress(a, hn::RebindMask(du, mask)), du, to_a);
+    hn::StoreU(hn::Compress(b, mask), d, to_b);
+    return hn::CountTrue(d, mask);
+#endif
+}
+
 /// The largest coordinate of the tree, of either sign.
 inline float extent_of(const Tree& tree) {
     float extent = 0;
@@ -43,14 +91,14 @@ inline float extent_of(const Tree& tree) {
 struct alignas(64) TracedRay {
     // Box test: a plane's depth is plane * inverse + shift, where the shift already holds a margin, towards the ray's
     // start for near planes and away from it for far ones.
-    float inverse[3];
-    float near_shift[3];
-    float far_shift[3];
+    float inverse[4];
+    float near_shift[4];
+    float far_shift[4];
     float start;  ///< no depth below this counts
     float reach;  ///< nor one beyond this; both with room for the errors of box and triangle tests
     uint32_t octant;
-    uint32_t near_planes[3];  ///< from the node's first float to the planes that the ray meets first, per axis
-    uint32_t far_planes[3];
+    uint32_t near_planes[4];  ///< from the node's first float to the planes that the ray meets first, per axis
+    uint32_t far_planes[4];
     // Triangle test: axes permuted so that z is the direction's largest component, then sheared (Woop, Benthin and
     // Wald 2013).
     uint32_t x, y, z;  ///< from a corner's first float to its coordinates on that axis
@@ -71,46 +119,58 @@ struct alignas(64) TracedRay {
     ///
     /// A component below 2^-25 of the largest is made that large. Within the depths at which the tree lies, at most
     /// extent + |origin|, that moves the ray by less than 2^-24 times that; the margin takes the double.
-    void start_from(const Ray& given, float extent) {
+    HWY_INLINE void start_from(const Ray& given, float extent) {
+        // Without branches, which rays in all directions would make the processor guess wrong.
+        static_assert(sizeof(Ray) == 8 * sizeof(float));
+        const hn::CappedTag<float, 4> d;
+        const hn::RebindToUnsigned<decltype(d)> du;
+        const auto origin = hn::LoadU(d, &given.origin.x);        // and t_min
+        const auto direction = hn::LoadU(d, &given.direction.x);  // and t_max
         const Vec3f size{std::abs(given.direction.x), std::abs(given.direction.y), std::abs(given.direction.z)};
-        const int kz = size.x > size.y ? (size.x > size.z ? 0 : 2) : (size.y > size.z ? 1 : 2);
-        const int kx = kz == 2 ? 0 : kz + 1;
-        const int ky = kx == 2 ? 0 : kx + 1;
-        const float largest = size[kz];
+        const float larger = std::max(size.x, size.y);
+        const float largest = std::max(larger, size.z);
+        const uint32_t kz = larger > size.z ? (size.x > size.y ? 0U : 1U) : 2U;
+        constexpr uint32_t kAfter[4] = {1, 2, 0, 1};
+        const uint32_t kx = kAfter[kz];
+        const uint32_t ky = kAfter[kz + 1];
+
+        const auto negative = hn::Lt(direction, hn::Zero(d));
+        octant = mask_bits(d, negative) & 7U;
+        const auto steepness =
+            hn::Div(hn::Set(d, largest), hn::Max(hn::Abs(direction), hn::Set(d, largest * 0x1p-25F)));
+        const auto signed_steepness = hn::IfThenElse(negative, hn::Neg(steepness), steepness);
+        const auto shift = hn::Neg(hn::Mul(origin, signed_steepness));
         const float farthest =
             extent + std::max({std::abs(given.origin.x), std::abs(given.origin.y), std::abs(given.origin.z)});
-        octant = 0;
-        for (int axis = 0; axis < 3; ++axis) {
-            const bool negative = given.direction[axis] < 0;
-            octant |= negative ? 1U << axis : 0U;
-            const bool is_flat = size[axis] < largest * 0x1p-25F;
-            const float steepness = is_flat ? 0x1p25F : largest / size[axis];
-            inverse[axis] = negative ? -steepness : steepness;
-            const float shift = -given.origin[axis] * inverse[axis];
-#if HWY_NATIVE_FMA
-            const float room = std::abs(shift) * 0x1p-22F;
-#else
-            const float room = (std::abs(shift) + extent * steepness) * 0x1p-22F;
+        auto room = hn::Abs(shift);
+#if !HWY_NATIVE_FMA
+        room = hn::MulAdd(hn::Set(d, extent), steepness, room);
 #endif
-            const float margin = room + (is_flat ? farthest * 0x1p-23F * steepness : 0.0F) + kTiny;
-            near_shift[axis] = shift - margin;
-            far_shift[axis] = shift + margin;
-            const auto first = static_cast<uint32_t>(axis * WideNode::kWidth);
-            near_planes[axis] = first + (negative ? 3 * WideNode::kWidth : 0);
-            far_planes[axis] = first + (negative ? 0 : 3 * WideNode::kWidth);
-        }
+        const auto flat = hn::IfThenElseZero(hn::Ge(steepness, hn::Set(d, 0x1p24F)), hn::Set(d, farthest * 0x1p-22F));
+        const auto margin = hn::MulAdd(flat, steepness, hn::MulAdd(room, hn::Set(d, 0x1p-22F), hn::Set(d, kTiny)));
+        hn::StoreU(signed_steepness, d, inverse);
+        hn::StoreU(hn::Sub(shift, margin), d, near_shift);
+        hn::StoreU(hn::Add(shift, margin), d, far_shift);
+        const auto first = hn::Mul(hn::Iota(du, 0), hn::Set(du, WideNode::kWidth));
+        const auto second = hn::Add(first, hn::Set(du, 3 * WideNode::kWidth));
+        const auto negative_u = hn::RebindMask(du, negative);
+        hn::StoreU(hn::IfThenElse(negative_u, second, first), du, near_planes);
+        hn::StoreU(hn::IfThenElse(negative_u, first, second), du, far_planes);
+
         start = given.t_min * largest * (1 - 0x1p-21F) - kTiny;
         sure_start = given.t_min * largest * (1 + 0x1p-21F) + kTiny;
         sure_end = given.t_max * largest * (1 - 0x1p-21F) - kTiny;
-        x = static_cast<uint32_t>(kx) * kBlockSize;
-        y = static_cast<uint32_t>(ky) * kBlockSize;
-        z = static_cast<uint32_t>(kz) * kBlockSize;
-        ox = given.origin[kx];
-        oy = given.origin[ky];
-        oz = given.origin[kz];
-        sx = given.direction[kx] / given.direction[kz];
-        sy = given.direction[ky] / given.direction[kz];
-        sign = given.direction[kz] < 0 ? -1.0F : 1.0F;
+        x = kx * kBlockSize;
+        y = ky * kBlockSize;
+        z = kz * kBlockSize;
+        const float* o = &given.origin.x;
+        const float* along = &given.direction.x;
+        ox = o[kx];
+        oy = o[ky];
+        oz = o[kz];
+        sx = along[kx] / along[kz];
+        sy = along[ky] / along[kz];
+        sign = std::copysign(1.0F, along[kz]);
         place = kNoPlace;
         shorten(0, given.t_max * largest);
         lower = kInfinity;

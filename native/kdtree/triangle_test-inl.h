@@ -33,13 +33,6 @@ struct Verdict {
     uint32_t certain;  ///< lanes that the line meets, by whatever depth
 };
 
-template <class D, class M>
-HWY_INLINE uint32_t mask_bits(D d, M mask) {
-    uint8_t bits[8] = {};
-    hn::StoreMaskBits(d, mask, bits);
-    return bits[0] | uint32_t{bits[1]} << 8;
-}
-
 /// The larger of the sizes of three numbers.
 template <class V>
 HWY_INLINE V largest_of(const V (&c)[3]) {
