@@ -80,6 +80,23 @@ HWY_INLINE hn::Vec<D8> in_order(D8 d8, hn::Vec<D8> bytes) {
     return hn::BitCast(d8, hn::TableLookupLanes(hn::BitCast(d32, grouped), hn::SetTableIndices(d32, from)));
 }
 
+/// Truncates numbers that an int can hold. Highway's ConvertTo takes four more instructions for those it cannot.
+template <class DI, class VF>
+HWY_INLINE hn::Vec<DI> truncate(DI di, VF v) {
+#if HWY_TARGET == HWY_AVX3_DL
+    if constexpr (hn::MaxLanes(DI()) == 16) {
+        return hn::Vec<DI>{_mm512_cvttps_epi32(v.raw)};
+    }
+#elif HWY_TARGET == HWY_AVX2
+    if constexpr (hn::MaxLanes(DI()) == 8) {
+        return hn::Vec<DI>{_mm256_cvttps_epi32(v.raw)};
+    }
+#elif HWY_TARGET == HWY_SSE4
+    return hn::Vec<DI>{_mm_cvttps_epi32(v.raw)};
+#endif
+    return hn::ConvertTo(di, v);
+}
+
 /// begin: the last slice that starts at or before the lower bound. end: the last slice that starts before the upper
 /// bound, and not before `begin`, so that a reference that lies in a plane counts behind it. Both from 0 to `last`.
 /// Padded to vectors of 64 with `last`. References keep their order if asked to.
@@ -92,19 +109,19 @@ HWY_INLINE void quantise(D df, const float* lower, const float* upper, Slices sl
     constexpr uint32_t kLanes = hn::MaxLanes(D());
     const auto origin = hn::Set(df, slices.origin);
     const auto scale = hn::Set(df, slices.scale);
+    // So that what ends in a plane ends before it; what ends less behind it than its position is rounded may, too.
+    const auto end_scale = hn::Set(df, slices.scale * (1 - 0x1p-22F));
     const auto zero = hn::Zero(d16);
     const auto top = hn::Set(d16, static_cast<int16_t>(last));
     const auto step = [&](uint32_t i, auto load) {
-        const auto begins = [&](uint32_t k) { return hn::ConvertTo(di, load(lower, i + k * kLanes)); };
-        const auto ends = [&](uint32_t k) { return hn::ConvertTo(di, hn::Ceil(load(upper, i + k * kLanes))); };
         // What lies outside the interval saturates.
-        const auto begin = [&](uint32_t k) {
-            return hn::Max(zero, hn::Min(hn::ReorderDemote2To(d16, begins(k), begins(k + 1)), top));
+        const auto two_vectors = [&](const float* values, uint32_t k, auto by) {
+            const auto low = truncate(di, hn::Mul(load(values, i + k * kLanes), by));
+            const auto high = truncate(di, hn::Mul(load(values, i + (k + 1) * kLanes), by));
+            return hn::Min(hn::ReorderDemote2To(d16, low, high), top);
         };
-        const auto end = [&](uint32_t k, auto least) {
-            const auto behind = hn::Max(zero, hn::ReorderDemote2To(d16, ends(k), ends(k + 1)));
-            return hn::Max(least, hn::Min(hn::Sub(behind, hn::Set(d16, 1)), top));
-        };
+        const auto begin = [&](uint32_t k) { return hn::Max(zero, two_vectors(lower, k, scale)); };
+        const auto end = [&](uint32_t k, auto least) { return hn::Max(least, two_vectors(upper, k, end_scale)); };
         const auto begin0 = begin(0);
         const auto begin1 = begin(2);
         auto begin_bytes = join_bytes(d8, begin0, begin1);
@@ -116,17 +133,18 @@ HWY_INLINE void quantise(D df, const float* lower, const float* upper, Slices sl
         hn::Store(begin_bytes, d8, out.begin + i);
         hn::Store(end_bytes, d8, out.end + i);
     };
-    const auto in_slices = [&](const float* values, uint32_t i) {
-        return hn::Mul(hn::Sub(hn::LoadU(df, values + i), origin), scale);
+    const auto from_origin = [&](const float* values, uint32_t at) {
+        return hn::Sub(hn::LoadU(df, values + at), origin);
     };
     uint32_t i = 0;
     for (; i + 4 * kLanes <= count; i += 4 * kLanes) {
-        step(i, in_slices);
+        step(i, from_origin);
     }
+    const auto far_behind = hn::Set(df, (1.0F + static_cast<float>(kSlices)) / slices.scale);
     for (; i < (count + 63) / 64 * 64; i += 4 * kLanes) {
         step(i, [&](const float* values, uint32_t at) {
             const auto exists = hn::FirstN(df, at < count ? count - at : 0);
-            return hn::IfThenElse(exists, in_slices(values, at), hn::Set(df, 1.0F + static_cast<float>(kSlices)));
+            return hn::IfThenElse(exists, from_origin(values, at), far_behind);
         });
     }
 }

@@ -22,11 +22,16 @@ namespace hn = hwy::HWY_NAMESPACE;
 
 template <class D>
 HWY_INLINE uint64_t mask_bits(D d, hn::Mask<D> mask) {
+#if HWY_TARGET == HWY_AVX3_DL
+    (void)d;
+    return mask.raw;
+#else
     uint8_t bytes[8] = {};
     hn::StoreMaskBits(d, mask, bytes);
     uint64_t bits = 0;
     std::memcpy(&bits, bytes, sizeof bits);
     return bits;
+#endif
 }
 
 /// For each mask of so many lanes, which lane goes where: the chosen ones first, in order.
