@@ -15,6 +15,7 @@
 
 #include "kdtree/binning-inl.h"
 #include "kdtree/build_kernels.h"
+#include "kdtree/corners-inl.h"
 
 HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
@@ -104,17 +105,12 @@ HWY_INLINE void clip_straddlers(D d, const TriangleSoup& soup, Split split, cons
         const uint32_t active = std::min(lanes, straddlers.count - begin);
         const auto at_left = hn::Load(di, reinterpret_cast<const int32_t*>(straddlers.left + begin));
         const auto at_right = hn::Load(di, reinterpret_cast<const int32_t*>(straddlers.right + begin));
-        const auto triangle = hn::GatherIndex(di, reinterpret_cast<const int32_t*>(left.triangle), at_left);
-        const auto corner0 = hn::Add(triangle, hn::Add(triangle, triangle));
-        V v[3][3];
-        for (int k = 0; k < 3; ++k) {
-            const auto vertex =
-                hn::GatherIndex(di, reinterpret_cast<const int32_t*>(soup.triangles.data()) + k, corner0);
-            const auto index = hn::Add(vertex, hn::Add(vertex, vertex));
-            for (int axis = 0; axis < 3; ++axis) {
-                v[k][axis] = hn::GatherIndex(d, soup.positions.data() + axis, index);
-            }
+        alignas(64) uint32_t triangles[hn::MaxLanes(D())];
+        for (uint32_t i = 0; i < lanes; ++i) {
+            triangles[i] = left.triangle[straddlers.left[begin + i]];
         }
+        V v[3][3];
+        load_corners(d, soup, triangles, v);
         hn::Mask<D> on_left[3];
         hn::Mask<D> on_right[3];
         hn::Mask<D> crosses[3];
