@@ -5,13 +5,14 @@
 # make test-neon              the C++ tests under an emulator of ARM; the same tree and the same hits on all instruction sets
 # make package                build/espalier-VERSION.zip, the extension as users install it
 # make bench [BENCH=--quick]  measures builds and rays beside Embree on the meshes it finds; BENCH=--help tells more
+# make report [REPORT=--quick] one page: speed against error beside other tracers, and the pixels of Cycles
 # make sanitize               the C++ tests under the address, undefined-behaviour and thread sanitizers
 # make lint | make format     checks or applies the style of Python and C++
 # make blenders               the other Blenders the installation tests run in (root, 4 GB, kept in the user's cache)
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
-.PHONY: preview test test-native test-neon long-run package bench sanitize lint format blenders native system python clean
+.PHONY: preview test test-native test-neon long-run package bench report sanitize lint format blenders native system python clean
 
 SCENE ?= build/scenes/interior.blend
 CACHE := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/espalier
@@ -72,6 +73,16 @@ bench: native
 	cmake --preset release -B build/bench -DESPALIER_TESTS=OFF -DESPALIER_BENCH=ON >/dev/null
 	cmake --build build/bench -j $(JOBS)
 	python -m bench.run $(BENCH)
+
+report: native build/bench/bench.json
+	@tools/need $(TEST_SYSTEM)
+	@tools/environment .venv "3.11 3.13" -r requirements/test.txt
+	cmake --preset release -DESPALIER_TESTS=ON
+	cmake --build --preset release -j $(JOBS) --target espalier_judge
+	python -m addon report $(REPORT)
+
+build/bench/bench.json:
+	$(MAKE) bench BENCH="--quick --meshes sponza,dragon,sculpture"
 
 sanitize: sanitize-asan sanitize-tsan
 sanitize-%: python

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`blender -b FILE -c espalier preview …`, or `python -m addon preview SCENE …` with pip's bpy"""
+"""`blender -b FILE -c espalier preview …`, or `python -m addon preview SCENE …` with pip's bpy; and `report`"""
 
 from __future__ import annotations
 
 import argparse
 import json
+import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -20,6 +21,7 @@ from .pipeline import Cancelled, Options, Result, Run, evaluate, thread_counts
 BAD_ARGUMENTS = 2
 FAILURE = 1
 MAX_THREADS = 1024
+CHECKOUT = Path(__file__).resolve().parent.parent
 
 _handle: Any = None
 
@@ -35,10 +37,11 @@ def main(argv: Sequence[str], *, needs_file: bool = False) -> int:
         arguments = _parser().parse_args(list(argv))
     except SystemExit as leaving:  # argparse leaves the interpreter, which would be Blender
         return leaving.code if isinstance(leaving.code, int) else BAD_ARGUMENTS
-    if needs_file and arguments.scene is None and not Path(bpy.data.filepath).is_file():
+    if needs_file and arguments.run is preview and arguments.scene is None and not Path(bpy.data.filepath).is_file():
         return _fail("no file is open: name one that exists, `blender -b FILE -c espalier …`, or a SCENE")
     try:
-        return preview(arguments)
+        code: int = arguments.run(arguments)
+        return code
     except (KeyboardInterrupt, Cancelled):
         return _fail("cancelled")
     except Exception as error:  # a script reads the exit code, a person the sentence
@@ -79,6 +82,15 @@ def preview(arguments: argparse.Namespace) -> int:
     if len(report.checksums(result.report)) > 1:
         return _fail("the trees differ between thread counts")
     return 0
+
+
+def make_report(arguments: argparse.Namespace) -> int:
+    """Measure speed against error and write the page, which takes the judge of a checkout, and the peers."""
+    if not (CHECKOUT / "tools/report.py").is_file():
+        return _fail("the report compares with other tracers and needs a checkout of Espalier: run `make report` there")
+    # A process of its own: it opens other scenes, and brings Embree along.
+    words = [*(["--quick"] if arguments.quick else []), "--output", str(arguments.output)]
+    return subprocess.run([sys.executable, "-m", "tools.report", *words], cwd=CHECKOUT, check=False).returncode
 
 
 def open_scene(path: Path) -> None:
@@ -147,6 +159,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     command = commands.add_parser("preview", help="draw the scene from its camera, compare builds by thread count")
+    command.set_defaults(run=preview)
     command.add_argument(
         "scene",
         nargs="?",
@@ -167,6 +180,12 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--samples", type=_number(1, 4096), default=4, metavar="N", help="rays per pixel; default: 4")
     command.add_argument(
         "--percentage", type=_number(1, 1000), metavar="P", help="of the scene's resolution; default: the scene's own"
+    )
+    command = commands.add_parser("report", help="measure speed against error beside other tracers (in a checkout)")
+    command.set_defaults(run=make_report)
+    command.add_argument("--quick", action="store_true", help="fewer rays, samples and pixels: a look, not a figure")
+    command.add_argument(
+        "--output", type=lambda text: Path(text).absolute(), default=CHECKOUT / "build/report", metavar="FOLDER"
     )
     return parser
 

@@ -359,10 +359,10 @@ def test_hits_are_told_where_they_are_and_whose() -> None:
     hits = tree.intersect(origins, directions)
     found = what.surface(hits["triangle"], hits["u"], hits["v"], directions)
     assert found["placement"].tolist() == [0, 1, -1]
-    np.testing.assert_allclose(found["position"], [[0.5, 0.25, 1.5], [0.5, 0.25, -1.5], [0, 0, 0]], atol=1e-6)
+    np.testing.assert_allclose(found["position"], np.array([[0.5, 0.25, 1.5], [0.5, 0.25, -1.5], [0, 0, 0]]), atol=1e-6)
     np.testing.assert_allclose(found["geometric_normal"], [[0, 0, 1], [0, 0, -1], [0, 0, 0]], atol=1e-12)
     leaning = np.array([0.5, 0, 1]) / np.hypot(0.5, 1)
-    np.testing.assert_allclose(found["shading_normal"], np.outer([1, -1, 0], leaning), atol=1e-6)
+    np.testing.assert_allclose(found["shading_normal"], np.array([leaning, -leaning, 0 * leaning]), atol=1e-6)
     with pytest.raises(IndexError, match="triangle 4 is not in the scene"):
         what.surface(np.array([4], np.int32), hits["u"][:1], hits["v"][:1], directions[:1])
     with pytest.raises(ValueError, match="directions"):
