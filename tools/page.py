@@ -80,7 +80,7 @@ def named(part: Part) -> str:
     measured = part["measured"]
     here = measured["machine"] if isinstance(measured, dict) and "machine" in measured else part["machine"]
     threads = here.get("threads") or here["cores"]
-    parts = [here["cpu"], f"{threads} hardware threads", part["machine"]["simd"]]
+    parts = [here["cpu"], f"{threads} hardware thread{'' if threads == 1 else 's'}", part["machine"]["simd"]]
     load = here.get("load", part["load"])
     if load > 0.5:
         parts.append(f"BUSY at the start (load {load:.1f}): not for quoting")
@@ -170,7 +170,7 @@ def draw_tracers(measured: Part) -> Figure:
     axes[0].set_ylim(-0.6, len(rows) - 0.4)
     figure.suptitle(
         f"Speed on the camera rays of the living room; errors of {measured['hard_rays']:,} hard rays: aimed at "
-        "vertices and edges\nor along axes, near and far from the origin, judged in exact arithmetic",
+        "vertices and edges\nor along axes, near and far from the origin. Espalier traces in packets, others ray by ray.",
         x=0.01, ha="left", fontsize=11,
     )  # fmt: skip
     figure.tight_layout()
@@ -266,8 +266,9 @@ def tracers_table(measured: Part) -> str:
         for row in measured["rows"]
     )
     note = (
-        "Errors per million hard rays; another face at the same exact distance is no error. All are called from Python "
-        "on one thread with arrays of rays, BVHTree ray by ray, which is most of its time. "
+        "Errors per million hard rays, judged in exact arithmetic; another face at the same exact distance is no "
+        "error. All are called from Python on one thread. Embree (embreex) takes arrays and traces them ray by ray; "
+        "BVHTree is called for each ray, which is most of its time. "
         f"Cases: {', '.join(measured['hard_cases'])}."
     )
     return table(head, rows) + f'<p class="faint">{html.escape(note)}</p>'

@@ -230,7 +230,7 @@ def measure_pictures(quick: bool) -> dict[str, Any]:
         )
 
     # Sixteen times the most samples that are compared: what they have in common with it is a few per cent of the error.
-    most = 8 if quick else 32
+    most = 8 if quick else 16
     converged = draw("balanced", 16 * most)["image"][..., :3].astype(np.float64)
     rows = []
     samples = [1 << i for i in range(most.bit_length())]
