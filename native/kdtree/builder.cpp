@@ -119,7 +119,7 @@ Tree build(const TriangleSoup& soup, const BuildOptions& options) {
     tree.report.threads = builder.threads();
     tree.report.triangles = soup.size();
     tree.report.sah_constants = builder.parameters().sah;
-    measure_quality(tree);
+    measure_quality(tree, builder.threads());
     return tree;
 }
 

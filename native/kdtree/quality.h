@@ -6,6 +6,6 @@
 namespace espalier {
 
 /// Fills in what the report says of the finished tree: counts, bytes, SAH cost and checksum.
-void measure_quality(Tree& tree);
+void measure_quality(Tree& tree, int threads);
 
 }  // namespace espalier
