@@ -411,6 +411,99 @@ TEST(DoubleBounds, OfSidesAndDistances) {
     EXPECT_GT(estimate_share.largest(), 0.1);
 }
 
+/// Triangles whose distances differ by little or not at all, and floats next to a distance.
+TEST(DoubleBounds, LeaveNoComparisonOpen) {
+    Random random(8);
+    Share share("narrowed distance over 2^-27, 12");
+    uint32_t wrong = 0;
+    uint32_t close = 0;
+    uint32_t equal = 0;
+    for (const auto& [low, high] : kRanges) {
+        for (int i = 0; i < 3000; ++i) {
+            const Aimed aimed = aim(random, low, high);
+            const Ray& ray = aimed.ray;
+            Vec3f other[3] = {aimed.corner[1], aimed.corner[2], aimed.corner[0]};
+            for (uint32_t n = random.below(3); n != 0; --n) {
+                Vec3f& corner = other[random.below(3)];
+                corner.x = std::nextafter(corner.x, random.below(2) == 0 ? HUGE_VALF : -HUGE_VALF);
+            }
+            ExactHit a;
+            ExactHit b;
+            if (!has_area(aimed.corner) || !has_area(other) ||
+                !hit_exactly(ray.origin, ray.direction, aimed.corner, a) ||
+                !hit_exactly(ray.origin, ray.direction, other, b)) {
+                continue;
+            }
+            const Exact t = ExactTriangle(ray, aimed.corner).t();
+            const Exact t_other = ExactTriangle(ray, other).t();
+            wrong += compare_distance(ray.origin, ray.direction, a, b) != sgn(Exact(t - t_other)) ? 1U : 0U;
+            close += size_of(t - t_other) <= Exact(a.error) + b.error ? 1U : 0U;
+            equal += t == t_other ? 1U : 0U;
+            auto limit = static_cast<float>(t.get_d());
+            for (uint32_t n = random.below(2); n != 0; --n) {
+                limit = std::nextafter(limit, HUGE_VALF);
+            }
+            wrong += compare_distance(ray.origin, ray.direction, a, limit) != sgn(Exact(t - limit)) ? 1U : 0U;
+            finish_distance(ray.origin, ray.direction, a);
+            share.add(a.t - t, size_of(t) * Exact(0x1p-27) + Exact(0x1p-1000));
+        }
+    }
+    EXPECT_EQ(wrong, 0U);
+    EXPECT_GT(close, 500U);
+    EXPECT_GT(equal, 500U);
+    EXPECT_LT(share.largest(), 1);
+}
+
+/// Sixteen rays from one point, or to one, beside the edges of one triangle: what packets make of them. Only answers
+/// can be seen from here.
+TEST(PacketBounds, LoseAndInventNothing) {
+    Random random(9);
+    uint32_t wrong = 0;
+    uint32_t hits = 0;
+    for (const auto& [low, high] : kRanges) {
+        for (int i = 0; i < 300; ++i) {
+            const Aimed aimed = aim(random, low, high);
+            if (!has_area(aimed.corner)) {
+                continue;
+            }
+            const std::vector<float> positions{aimed.corner[0].x, aimed.corner[0].y, aimed.corner[0].z,
+                                               aimed.corner[1].x, aimed.corner[1].y, aimed.corner[1].z,
+                                               aimed.corner[2].x, aimed.corner[2].y, aimed.corner[2].z};
+            const std::vector<uint32_t> triangle{0, 1, 2};
+            const Tree tree = build({positions, triangle}, {Quality::kBalanced, 1});
+            std::vector<Ray> rays;
+            const bool ends_together = random.below(2) == 0;
+            for (int n = 0; n < 16; ++n) {
+                const uint32_t k = random.below(3);
+                const double along = random.fraction();
+                const Vec3d target =
+                    to_double(aimed.corner[k]) * along + to_double(aimed.corner[(k + 1) % 3]) * (1 - along);
+                const Vec3d to_target = target - to_double(aimed.ray.origin);
+                const Vec3f direction = to_float(to_target * (ends_together ? -2.0 : 0x1p-3));
+                if (std::abs(direction[largest_axis(direction)]) < 0x1p-100F) {
+                    break;
+                }
+                rays.push_back(ends_together
+                                   ? Ray{to_float(to_double(aimed.ray.origin) - to_double(direction)), 0, direction, 1}
+                                   : Ray{aimed.ray.origin, 0, direction, HUGE_VALF});
+            }
+            std::vector<Hit> found(rays.size());
+            std::vector<uint8_t> blocked(rays.size());
+            intersect(tree, rays, found);
+            occluded(tree, rays, blocked);
+            for (size_t n = 0; n < rays.size(); ++n) {
+                const ExactTriangle truth(rays[n], aimed.corner);
+                const bool is_hit =
+                    truth.is_hit() && truth.t() >= 0 && (std::isinf(rays[n].t_max) || truth.t() <= rays[n].t_max);
+                hits += is_hit ? 1U : 0U;
+                wrong += is_hit == (found[n].triangle == 0) && is_hit == (blocked[n] != 0) ? 0U : 1U;
+            }
+        }
+    }
+    EXPECT_EQ(wrong, 0U);
+    EXPECT_GT(hits, 2000U);
+}
+
 }  // namespace
 }  // namespace espalier
 #endif
