@@ -37,8 +37,9 @@ class Share {
     Share& operator=(const Share&) = delete;
 
     void add(const Exact& error, const Exact& bound) {
-        const Exact share = size_of(error) / bound;
-        largest_ = std::max(largest_, share.get_d());
+        if (error != 0) {
+            largest_ = std::max(largest_, bound > 0 ? Exact(size_of(error) / bound).get_d() : HUGE_VAL);
+        }
     }
     double largest() const { return largest_; }
 
