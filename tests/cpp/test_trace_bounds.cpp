@@ -454,7 +454,7 @@ TEST(DoubleBounds, LeaveNoComparisonOpen) {
     EXPECT_LT(share.largest(), 1);
 }
 
-/// Sixteen rays from one point, or to one, beside the edges of one triangle: what packets make of them. Only answers
+/// Rays from one point, or to one, beside the edges of one triangle: what packets make of them. Only answers
 /// can be seen from here.
 TEST(PacketBounds, LoseAndInventNothing) {
     Random random(9);
@@ -473,7 +473,7 @@ TEST(PacketBounds, LoseAndInventNothing) {
             const Tree tree = build({positions, triangle}, {Quality::kBalanced, 1});
             std::vector<Ray> rays;
             const bool ends_together = random.below(2) == 0;
-            for (int n = 0; n < 16; ++n) {
+            for (int n = 0; n < 32; ++n) {
                 const uint32_t k = random.below(3);
                 const double along = random.fraction();
                 const Vec3d target =

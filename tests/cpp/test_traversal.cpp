@@ -217,14 +217,14 @@ TEST(Traversal, RaysMayEndTogetherAnywhere) {
     for (int exponent = 3; exponent < 100; ++exponent) {
         const float far = std::ldexp(1.7F, exponent);
         std::vector<Ray> rays;
-        for (int i = 0; i < 16; ++i) {
+        for (int i = 0; i < 32; ++i) {
             const auto step = static_cast<float>(i);
             const Vec3f direction{0.0371F * far * (1 + step * 0x1p-23F), 0.0237F * far * (1 + step * 0x1p-23F), far};
-            rays.push_back({{0.01F * step - 0.3F, 0.02F * step, -3}, 0, direction, 1});
+            rays.push_back({{0.01F * step - 0.3F, 0.01F * step, -3}, 0, direction, 1});
         }
         std::vector<uint8_t> blocked(rays.size());
         occluded(tree, rays, blocked);
-        EXPECT_EQ(std::count(blocked.begin(), blocked.end(), 1), 16) << exponent;
+        EXPECT_EQ(std::count(blocked.begin(), blocked.end(), 1), 32) << exponent;
     }
 }
 
