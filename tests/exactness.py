@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.fast_judge import Errors, Verdicts, errors, judge_rays
-from tests.hard_cases import CASES, along_a_curve, make
+from tests.hard_cases import CASES, PACKET, along_a_curve, make
 from tests.judge import Floats, Ints
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -68,7 +68,7 @@ WAYS = {
     "sorted": Way("sorted", 1 << 30, share=3),
     "threads": Way("given", 1 << 30, threads=3, share=3),
     "1000": Way("given", 1000, share=5),
-    "packets": Way("given", 16, share=5),
+    "packets": Way("given", PACKET, share=5),
     "7": Way("sorted", 7, share=11),
     "single": Way("given", 1, share=17),
 }
@@ -86,6 +86,7 @@ class Outcome:
     errors: Errors
     shadows: int  # rays whose occlusion is wrong
     fingerprint: int  # of every bit that came back, for the ways that take all rays
+    tree: str  # the checksum of the tree
 
     @property
     def wrong(self) -> bool:
@@ -105,15 +106,17 @@ def qualities() -> tuple[str, ...]:
 
 
 def ask(case: str, rays: int, seed: int = 0) -> Question:
-    """A case's rays and, for some that hit, the same ray cut off at the hit, an ulp before it, and begun there."""
+    """A case's rays, in packets that end at infinity, at 1 and before; and for some rays that hit, the same cut off at
+    the hit or an ulp before it, and begun at the hit or an ulp behind."""
     vertices, triangles, origins, directions = make(case, rays * 5 // 8, seed)
     whole = judge_rays(vertices, triangles, origins, directions)
-    t_min, t_max = np.zeros(len(origins), np.float32), np.full(len(origins), np.inf, np.float32)
-    t_max[3::8] = 1  # what was aimed at lies at 1, or an ulp beside it
+    t_min = np.zeros(len(origins), np.float32)
+    # What was aimed at lies at 1, or an ulp beside it.
+    t_max = np.resize(np.repeat(np.array([np.inf, 1, 1, 0.99], np.float32), PACKET), len(origins))
 
     with np.errstate(over="ignore"):
         nearest = whole.t.astype(np.float32)
-    cut = np.flatnonzero((whole.triangle >= 0) & np.isfinite(nearest))[::8][: rays * 3 // 32]
+    cut = np.flatnonzero((whole.triangle >= 0) & np.isfinite(nearest))[::5][: rays * 3 // 32]
     at, zero, infinite = nearest[cut], np.zeros(len(cut), np.float32), np.full(len(cut), np.inf, np.float32)
     after, before = np.nextafter(at, np.float32(np.inf)), np.nextafter(at, np.float32(0))
     pick = np.concatenate([np.arange(len(origins)), cut, cut, cut, cut])
@@ -171,7 +174,8 @@ def outcomes(case: str, question: Question, ways: Iterable[tuple[str, str]]) -> 
         true = question.verdicts
         judged = errors(hits, Verdicts(true.triangle[taken], true.t[taken], true.u[taken], true.v[taken]))
         target = espalier_native.simd_targets()[0]
-        found.append(Outcome(case, target, quality, name, len(taken), judged, shadows, fingerprint))
+        tree = trees[quality].report["checksum"]
+        found.append(Outcome(case, target, quality, name, len(taken), judged, shadows, fingerprint, tree))
     return found
 
 
@@ -274,7 +278,7 @@ def merged(found: list[Outcome]) -> list[Outcome]:
                 max(a.t_ulps, b.t_ulps),
                 max(a.uv, b.uv),
             )
-            sums[key] = Outcome(o.case, *key, sums[key].rays + o.rays, both, sums[key].shadows + o.shadows, 0)
+            sums[key] = Outcome(o.case, *key, sums[key].rays + o.rays, both, sums[key].shadows + o.shadows, 0, "")
         else:
             sums[key] = o
     return list(sums.values())

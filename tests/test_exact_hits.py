@@ -30,6 +30,7 @@ def test_hits_are_exact(case: str, pools: dict[str, ProcessPoolExecutor]) -> Non
     found = trace_everywhere(pools, case, question, [every_way] * len(pools))
     JUDGED[case] = len(question.origins)
     assert [outcome for outcome in found if outcome.wrong] == []
+    assert len({(outcome.quality, outcome.tree) for outcome in found}) == len(qualities()), "one tree per mode"
     assert len({outcome.fingerprint for outcome in found if WAYS[outcome.way].share == 1}) == 1, "the same, bit for bit"
 
 

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 #include <gtest/gtest.h>
 
+#include <cmath>
 #include <cstring>
 
 #include "geometry/float_environment.h"
@@ -96,6 +97,29 @@ TEST(FloatEnvironment, OfTheHostChangesNothing) {
             EXPECT_EQ(answers.blocked, expected.blocked);
         }
     }
+}
+
+#if defined(__x86_64__)
+__attribute__((target("fma"), noinline))
+#else
+__attribute__((noinline))
+#endif
+double multiply_and_add(double a, double b, double c) {
+    return a * b + c;
+}
+
+/// The sources are compiled so that a product is rounded before it is added to something, even where the processor
+/// could do both at once. Otherwise t, u and v, and the costs by which planes are chosen, depend on the machine. This
+/// file is compiled with the same options.
+TEST(FloatEnvironment, ProductsAreRoundedBeforeTheyAreAdded) {
+#if defined(__x86_64__)
+    if (!__builtin_cpu_supports("fma")) {
+        GTEST_SKIP() << "this processor has no fused operations";
+    }
+#endif
+    const double a = 1 + 0x1p-30;
+    EXPECT_EQ(multiply_and_add(a, a, -(1 + 0x1p-29)), 0);
+    EXPECT_EQ(std::fma(a, a, -(1 + 0x1p-29)), 0x1p-60) << "what a fused operation gives";
 }
 
 }  // namespace

@@ -13,8 +13,9 @@
 namespace espalier {
 namespace {
 
-/// The same triangles in one leaf: every ray tests them all, and nothing but the triangle test decides.
-Tree make_flat_list(const Mesh& mesh) {
+/// The same triangles in a chain of nodes whose boxes are met by every ray: it tests them all, and nothing but the
+/// triangle test decides.
+Tree make_flat_list(const Mesh& mesh, uint32_t longest_leaf = WideNode::kMaxLeafBlocks) {
     Tree tree = build(mesh.soup(), {Quality::kBalanced, 1});
     const uint32_t count = mesh.soup().size();
     tree.blocks = LargeBuffer<TriangleBlock>(block_count(count));
@@ -27,7 +28,7 @@ Tree make_flat_list(const Mesh& mesh) {
             }
         }
     }
-    const uint32_t leaves = (block_count(count) + WideNode::kMaxLeafBlocks - 1) / WideNode::kMaxLeafBlocks;
+    const uint32_t leaves = (block_count(count) + longest_leaf - 1) / longest_leaf;
     tree.wide_nodes = LargeBuffer<WideNode>((leaves + WideNode::kWidth - 2) / (WideNode::kWidth - 1));
     uint32_t first = 0;
     for (uint32_t n = 0; n < tree.wide_nodes.size(); ++n) {
@@ -35,7 +36,7 @@ Tree make_flat_list(const Mesh& mesh) {
         const bool has_next = n + 1 < tree.wide_nodes.size();
         for (int i = 0; i < WideNode::kWidth; ++i) {
             const bool is_link = i == WideNode::kWidth - 1 && has_next;
-            const uint32_t blocks = is_link ? 0 : std::min(WideNode::kMaxLeafBlocks, block_count(count) - first);
+            const uint32_t blocks = is_link ? 0 : std::min(longest_leaf, block_count(count) - first);
             const bool used = is_link || blocks != 0;
             for (int axis = 0; axis < 3; ++axis) {
                 node.lower[axis][i] = used ? -1e20F : INFINITY;
@@ -187,6 +188,36 @@ TEST(Traversal, IsTheSameInAnyBatch) {
         }
         EXPECT_EQ(wrong_shuffled, 0U);
     }
+}
+
+/// 70 nodes below one another, each with seven leaves that have to wait: as much as a ray ever has to remember. The
+/// first of the leaves that waited is the one that counts.
+TEST(Traversal, RemembersAllThatWaits) {
+    constexpr uint32_t kLevels = 70;
+    Mesh mesh;
+    for (uint32_t i = 0; i < kLevels * (WideNode::kWidth - 1) * kBlockSize; ++i) {
+        const float z = 1 + static_cast<float>(i);
+        mesh.add_triangle({-1, -1, z}, {2, -1, z}, {-1, 2, z});
+    }
+    const Tree tree = make_flat_list(mesh, 1);
+    EXPECT_EQ(tree.wide_nodes.size(), kLevels);
+    std::vector<Ray> rays;
+    for (uint32_t i = 0; i < 100; ++i) {
+        rays.push_back({{0, 0.001F * static_cast<float>(i), 0}, 0, {0, 0, 1}, INFINITY});
+    }
+    std::vector<Hit> hits(rays.size());
+    for (const size_t count : {size_t{1}, rays.size()}) {
+        intersect(tree, std::span(rays).first(count), std::span(hits).first(count));
+        EXPECT_EQ(std::count_if(hits.begin(), hits.begin() + static_cast<long>(count),
+                                [](const Hit& hit) { return hit.triangle == 0 && hit.t == 1; }),
+                  static_cast<long>(count));
+    }
+    std::vector<uint8_t> blocked(rays.size());
+    for (Ray& ray : rays) {
+        ray.t_max = 1.5F;
+    }
+    occluded(tree, rays, blocked);
+    EXPECT_EQ(std::count(blocked.begin(), blocked.end(), 1), static_cast<long>(rays.size()));
 }
 
 TEST(Traversal, KeepsToTheRaysInterval) {
