@@ -169,8 +169,9 @@ def draw_tracers(measured: Part) -> Figure:
     axes[0].set_yticks(range(len(rows)), [row["tracer"] for row in rows])
     axes[0].set_ylim(-0.6, len(rows) - 0.4)
     figure.suptitle(
-        f"Speed on the camera rays of the living room; errors of {measured['hard_rays']:,} hard rays: aimed at vertices "
-        "and edges\nor along axes, near and far from the origin. Espalier traces in packets, others ray by ray.",
+        f"Speed on the camera rays of the living room; errors of {measured['hard_rays']:,} hard rays: aimed at "
+        "vertices and edges\nor along axes, near and far from the origin. "
+        "Espalier traces in packets, the others ray by ray.",
         x=0.01, ha="left", fontsize=11,
     )  # fmt: skip
     figure.tight_layout()
