@@ -5,6 +5,7 @@
 
 #include <cstddef>
 #include <cstdint>
+#include <memory>
 #include <new>
 #include <span>
 #include <type_traits>
@@ -19,6 +20,8 @@ class LargeBuffer {
     static_assert(std::is_trivially_copyable_v<T>);
 
  public:
+    static constexpr size_t kHugePage = size_t{2} << 20;
+
     LargeBuffer() = default;
     /// expected_bytes: how much will be used of a room that is larger than it needs to be.
     explicit LargeBuffer(size_t capacity, size_t expected_bytes = SIZE_MAX) : capacity_(capacity) {
@@ -38,12 +41,12 @@ class LargeBuffer {
             throw std::bad_alloc();
         }
         mapping_ = memory;
-        auto address = reinterpret_cast<uintptr_t>(memory);
         if (huge != 0) {
-            address = (address + kHugePage - 1) / kHugePage * kHugePage;
-            ::madvise(reinterpret_cast<void*>(address), huge, MADV_HUGEPAGE);
+            size_t space = mapped_;
+            std::align(kHugePage, bytes(), memory, space);
+            ::madvise(memory, huge, MADV_HUGEPAGE);
         }
-        data_ = reinterpret_cast<T*>(address);
+        data_ = static_cast<T*>(memory);
     }
     LargeBuffer(LargeBuffer&& other) noexcept { *this = std::move(other); }
     LargeBuffer& operator=(LargeBuffer&& other) noexcept {
@@ -83,6 +86,13 @@ class LargeBuffer {
         return reused;
     }
 
+    /// Takes the i-th huge page now, of those there are.
+    void take_huge_page(size_t i) {
+        if (i * kHugePage < bytes()) {
+            *(reinterpret_cast<volatile std::byte*>(data_) + i * kHugePage) = std::byte{0};
+        }
+    }
+
     T* data() { return data_; }
     const T* data() const { return data_; }
     size_t size() const { return capacity_; }
@@ -94,8 +104,7 @@ class LargeBuffer {
  private:
     template <class U>
     friend class LargeBuffer;
-    static constexpr size_t kPage = size_t{64} << 10;  ///< the largest small page of any system
-    static constexpr size_t kHugePage = size_t{2} << 20;
+    static constexpr size_t kPage = size_t{64} << 10;            ///< the largest small page of any system
     static constexpr size_t kHugePagesFrom = size_t{384} << 10;  ///< clearing the rest of the page costs as much
     T* data_ = nullptr;
     size_t capacity_ = 0;

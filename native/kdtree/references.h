@@ -60,6 +60,7 @@ class ReferenceBuffer {
     }
     const References& references() const { return references_; }
     size_t capacity() const { return stride_ - kSlack; }
+    LargeBuffer<uint32_t>& memory() { return memory_; }
     /// Gives the memory away.
     LargeBuffer<uint32_t> take_memory() {
         references_ = {};

@@ -53,6 +53,10 @@ TopLevels::TopLevels(const TriangleSoup& soup, const BuildParameters& parameters
 void TopLevels::make_references() {
     const uint32_t triangles = soup_.size();
     const size_t count = (triangles + segment_size_ - 1) / segment_size_;
+    // Every thread takes pages of its own: two that first wrote to one page at the same time would both clear it.
+    const size_t huge_pages = expected_block_bytes(triangles) / 2 / LargeBuffer<uint32_t>::kHugePage + 1;
+    parallel_for(threads_, huge_pages, [&](size_t i) { memory_.first().take_huge_page(i); });
+
     std::vector<Box3f> bounds(count);
     std::vector<RejectedFaces> rejected(count);
     TopNode root{};

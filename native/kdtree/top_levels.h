@@ -21,6 +21,7 @@ class SegmentMemory {
  public:
     SegmentMemory(size_t capacity, size_t later_bytes) { buffers_.emplace_back(capacity, later_bytes); }
     References take(uint32_t count);
+    LargeBuffer<uint32_t>& first() { return buffers_.front().memory(); }
     LargeBuffer<uint32_t> take_memory() { return buffers_.front().take_memory(); }
 
  private:
