@@ -7,8 +7,8 @@ namespace espalier {
 
 /// Phase 5: derives from the finished kd-tree what rays walk through: triangle blocks, and eight-wide nodes collapsed
 /// from the tree's nodes, each child with its tight box, in the order that the split planes give for each ray octant.
-/// boxes: tight, per kd node. triangles: kBlockSize face indices per block, padded with kNoTriangle; tree.blocks has room
-/// for them.
+/// boxes: tight, per kd node. triangles: kBlockSize face indices per block, padded with kNoTriangle; tree.blocks has
+/// room for them.
 void build_layout(const TriangleSoup& soup, std::span<const Box3f> boxes, std::span<const uint32_t> triangles,
                   int threads, Tree& tree);
 
