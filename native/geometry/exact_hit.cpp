@@ -66,7 +66,8 @@ bool hit_exactly(Vec3f origin, Vec3f direction, const Vec3f (&corner)[3], ExactH
     // side[k] belongs to the edge opposite corner k, and is that corner's weight.
     Side side[3];
     for (int k = 0; k < 3; ++k) {
-        side[k] = measure_side(d, p[(k + 1) % 3], p[(k + 2) % 3]);
+        const Vec3d edge = to_double(corner[(k + 2) % 3]) - to_double(corner[(k + 1) % 3]);
+        side[k] = measure_side(d, p[(k + 1) % 3], edge);
     }
     const auto add_up = [&](double& det, double& error) {
         det = side[0].value + side[1].value + side[2].value;

@@ -48,18 +48,21 @@ HWY_INLINE uint32_t finish_in_double(FinishBatch& batch) {
         const auto load = [&](const float* from) { return hn::PromoteTo(d, hn::Load(df, from + first)); };
         V dir[3];
         V p[3][3];
+        V edge[3][3];  // opposite corner k
         for (size_t axis = 0; axis < 3; ++axis) {
             const V origin = load(batch.origin[axis]);
             dir[axis] = load(batch.direction[axis]);
+            const V corner[3] = {load(batch.corner[0][axis]), load(batch.corner[1][axis]), load(batch.corner[2][axis])};
             for (size_t k = 0; k < 3; ++k) {
-                p[k][axis] = hn::Sub(load(batch.corner[k][axis]), origin);
+                p[k][axis] = hn::Sub(corner[k], origin);
+                edge[k][axis] = hn::Sub(corner[(k + 2) % 3], corner[(k + 1) % 3]);
             }
         }
         V side[3];
         V side_error[3];
         for (size_t k = 0; k < 3; ++k) {
             const V(&a)[3] = p[(k + 1) % 3];
-            const V(&b)[3] = p[(k + 2) % 3];
+            const V(&b)[3] = edge[k];
             V value[3];
             V size[3];
             for (size_t axis = 0; axis < 3; ++axis) {
@@ -109,7 +112,49 @@ HWY_INLINE uint32_t finish_in_double(FinishBatch& batch) {
     return open;
 }
 
+/// The same in float, for the path that does without exactness.
+HWY_INLINE void finish_in_float(FinishBatch& batch) {
+    const hn::CappedTag<float, FinishBatch::kSize> d;
+    constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<float, FinishBatch::kSize>());
+    using V = hn::Vec<decltype(d)>;
+    for (size_t first = 0; first < FinishBatch::kSize; first += kLanes) {
+        V p[3][3];
+        V dir[3];
+        for (size_t axis = 0; axis < 3; ++axis) {
+            dir[axis] = hn::Load(d, batch.direction[axis] + first);
+            for (size_t k = 0; k < 3; ++k) {
+                p[k][axis] =
+                    hn::Sub(hn::Load(d, batch.corner[k][axis] + first), hn::Load(d, batch.origin[axis] + first));
+            }
+        }
+        const auto side = [&](const V(&a)[3], const V(&b)[3]) {
+            V sum = hn::Zero(d);
+            for (size_t axis = 0; axis < 3; ++axis) {
+                const size_t y = (axis + 1) % 3;
+                const size_t z = (axis + 2) % 3;
+                sum = hn::MulAdd(dir[axis], hn::MulSub(a[y], b[z], hn::Mul(a[z], b[y])), sum);
+            }
+            return sum;
+        };
+        const V u = side(p[2], p[0]);
+        const V v = side(p[0], p[1]);
+        const V w = side(p[1], p[2]);
+        const V inverse = hn::Div(hn::Set(d, 1), hn::Add(u, hn::Add(v, w)));
+        V along = hn::Zero(d);
+        V square = along;
+        for (size_t axis = 0; axis < 3; ++axis) {
+            const V point = hn::MulAdd(u, p[1][axis], hn::MulAdd(v, p[2][axis], hn::Mul(w, p[0][axis])));
+            along = hn::MulAdd(hn::Mul(point, inverse), dir[axis], along);
+            square = hn::MulAdd(dir[axis], dir[axis], square);
+        }
+        hn::Store(hn::Div(along, square), d, batch.t + first);
+        hn::Store(hn::Mul(u, inverse), d, batch.u + first);
+        hn::Store(hn::Mul(v, inverse), d, batch.v + first);
+    }
+}
+
 /// Hits that wait to be finished together.
+template <bool kExact>
 class FinishQueue {
  public:
     FinishQueue(const TriangleBlock* blocks, std::span<const Ray> rays, std::span<Hit> hits)
@@ -141,7 +186,12 @@ class FinishQueue {
                 }
             }
         }
-        const uint32_t open = finish_in_double(batch);
+        uint32_t open = 0;
+        if constexpr (kExact) {
+            open = finish_in_double(batch);
+        } else {
+            finish_in_float(batch);
+        }
         for (size_t i = 0; i < count_; ++i) {
             const uint32_t ray = ray_[i];
             hits_[ray] = {batch.t[i], batch.u[i], batch.v[i], static_cast<int32_t>(triangle_at(blocks_, place_[i]))};

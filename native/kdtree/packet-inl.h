@@ -112,6 +112,7 @@ class Packet {
             }
             for (size_t axis = 0; axis < 3; ++axis) {
                 hn::Store(field(lane, 4 + axis), d, direction_[axis] + lane);
+                hn::Store(hn::Set(d, focus[static_cast<int>(axis)]), d, origin_[axis] + lane);
             }
         }
         is_reversed_ = false;
@@ -517,6 +518,14 @@ class Packet {
             if (kLanes != kRays && hn::AllFalse(d, inside)) {
                 continue;
             }
+            // Where the view from the packet's middle is too coarse for one of the rays, their own are finer.
+            const V det = hn::Abs(hn::Add(side[0], hn::Add(side[1], side[2])));
+            const auto is_clear =
+                hn::And(hn::Gt(depth_inside(side), bound), hn::Ge(det, hn::Mul(bound, hn::Set(d, 64))));
+            if (kExact && !hn::AllFalse(d, hn::AndNot(is_clear, inside))) {
+                taken |= test_from_origins(lane, place);
+                continue;
+            }
             taken |= take(lane, side, depth_inside(side), inside, bound, hn::Set(d, view.size[triangle]),
                           hn::Set(d, view.z[0][triangle]), hn::Set(d, view.z[1][triangle]),
                           hn::Set(d, view.z[2][triangle]), sign_, place);
@@ -562,8 +571,8 @@ class Packet {
         if (hn::AllFalse(d, inside)) {
             return false;
         }
-        return take(lane, side, inwards, inside, bound, mz, z[0], hn::Sub(z[1], z[0]), hn::Sub(z[2], z[0]), -sign_,
-                    place);
+        return take(lane, side, inwards, inside, bound, mz, z[0], hn::Sub(z[1], z[0]), hn::Sub(z[2], z[0]),
+                    is_reversed_ ? -sign_ : sign_, place);
     }
 
     /// Takes in a triangle for the rays that meet it, as Stream does. Depths are as test_blocks has them.
@@ -649,7 +658,7 @@ class Packet {
     float slope_x_, slope_y_, spread_x_, spread_y_;  ///< of the middle, and by how much rays differ from it
     float sign_, deviation_;
     alignas(64) float direction_[3][kRays];  ///< seen from the focus
-    alignas(64) float origin_[3][kRays];     ///< set where origins differ
+    alignas(64) float origin_[3][kRays];
     alignas(64) float inverse_[3][kRays], near_shift_[3][kRays], far_shift_[3][kRays];
     alignas(64) float own_slope_x_[kRays], own_slope_y_[kRays], off_x_[kRays], off_y_[kRays];
     alignas(64) float start_[kRays], reaches_[kRays], sure_start_[kRays], sure_end_[kRays], lower_[kRays];

@@ -13,57 +13,17 @@
 // Highway's own header has to follow foreach_target.h.
 #include <hwy/highway.h>
 
-#include "kdtree/packet-inl.h"
-#include "kdtree/stream-inl.h"
+#include "kdtree/trace-inl.h"
 
 HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
 
-/// Traces rays that belong together as packets and all others as a stream. Calls done(ray, place) for each.
-template <bool kAnyHit, bool kExact, class Done>
-HWY_INLINE void trace(const Tree& tree, std::span<const Ray> rays, const Done& done) {
-    constexpr size_t kChunk = 4096;
-    constexpr size_t kPacket = Packet<kAnyHit, kExact>::kRays;
-    Packet<kAnyHit, kExact> packet(tree);
-    Stream<kAnyHit, kExact> stream(tree, rays);
-    uint32_t single[kChunk];
-    for (size_t begin = 0; begin < rays.size(); begin += kChunk) {
-        const size_t end = std::min(begin + kChunk, rays.size());
-        size_t singles = 0;
-        size_t i = begin;
-        for (; i + kPacket <= end; i += kPacket) {
-            if (packet.gather(&rays[i])) {
-                packet.trace();
-                for (size_t lane = 0; lane < kPacket; ++lane) {
-                    done(static_cast<uint32_t>(i + lane), packet.place(lane));
-                }
-            } else {
-                for (size_t lane = 0; lane < kPacket; ++lane) {
-                    single[singles++] = static_cast<uint32_t>(i + lane);
-                }
-            }
-        }
-        for (; i < end; ++i) {
-            single[singles++] = static_cast<uint32_t>(i);
-        }
-        stream.run({single, singles}, [&](const StreamRay& ray) { done(ray.number, ray.place); });
-    }
-}
-
 void intersect(const Tree& tree, std::span<const Ray> rays, std::span<Hit> hits) {
-    FinishQueue queue(tree.blocks.data(), rays, hits);
-    trace<false, true>(tree, rays, [&](uint32_t ray, uint32_t place) {
-        if (place == kNoPlace) {
-            hits[ray] = missed(rays[ray]);
-        } else {
-            queue.add(ray, place);
-        }
-    });
-    queue.flush();
+    intersect_all<true>(tree, rays, hits);
 }
 
 void occluded(const Tree& tree, std::span<const Ray> rays, std::span<uint8_t> results) {
-    trace<true, true>(tree, rays, [&](uint32_t ray, uint32_t place) { results[ray] = place != kNoPlace ? 1 : 0; });
+    occluded_all<true>(tree, rays, results);
 }
 
 }  // namespace espalier::HWY_NAMESPACE

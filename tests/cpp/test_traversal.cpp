@@ -6,6 +6,7 @@
 #include <numeric>
 #include <random>
 
+#include "kdtree/plain_traversal.h"
 #include "kdtree/traversal.h"
 #include "meshes.h"
 #include "rays.h"
@@ -218,6 +219,30 @@ TEST(Traversal, RemembersAllThatWaits) {
     }
     occluded(tree, rays, blocked);
     EXPECT_EQ(std::count(blocked.begin(), blocked.end(), 1), static_cast<long>(rays.size()));
+}
+
+/// The path that exactness is priced against takes the same way, and is only seldom wrong.
+TEST(Traversal, PlainPathIsNearlyTheSame) {
+    const Mesh mesh = make_sphere(24, 32);
+    const Tree tree = build(mesh.soup(), {});
+    std::vector<Ray> rays = make_coherent_rays(mesh, 5);
+    for (const Ray& ray : make_rays(mesh, 4000, 6)) {
+        rays.push_back(ray);
+    }
+    std::erase_if(rays, [](const Ray& ray) { return ray.t_min > 0 || ray.t_max < 1; });  // ties are for the exact path
+    std::vector<Hit> hits(rays.size());
+    std::vector<Hit> plain(rays.size());
+    std::vector<uint8_t> blocked(rays.size());
+    intersect(tree, rays, hits);
+    plain_intersect(tree, rays, plain);
+    plain_occluded(tree, rays, blocked);
+    size_t different = 0;
+    for (size_t i = 0; i < rays.size(); ++i) {
+        const bool is_hit = hits[i].triangle >= 0;
+        const bool is_near = !is_hit || std::abs(plain[i].t - hits[i].t) <= 1e-3F * hits[i].t + 1e-5F;
+        different += (plain[i].triangle >= 0) == is_hit && (blocked[i] != 0) == is_hit && is_near ? 0U : 1U;
+    }
+    EXPECT_LT(different, rays.size() / 20);
 }
 
 TEST(Traversal, KeepsToTheRaysInterval) {

@@ -1,0 +1,75 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+// Which rays are traced in which way. Compiled once per instruction set (see traversal.cpp).
+
+#if defined(ESPALIER_KDTREE_TRACE_INL_H_) == defined(HWY_TARGET_TOGGLE)
+#ifdef ESPALIER_KDTREE_TRACE_INL_H_
+#undef ESPALIER_KDTREE_TRACE_INL_H_
+#else
+#define ESPALIER_KDTREE_TRACE_INL_H_
+#endif
+
+#include <hwy/highway.h>
+
+#include <algorithm>
+#include <cstdint>
+#include <span>
+
+#include "kdtree/finish-inl.h"
+#include "kdtree/packet-inl.h"
+#include "kdtree/stream-inl.h"
+
+HWY_BEFORE_NAMESPACE();
+namespace espalier::HWY_NAMESPACE {
+
+/// Traces rays that belong together as packets and all others as a stream. Calls done(ray, place) for each.
+template <bool kAnyHit, bool kExact, class Done>
+HWY_INLINE void trace(const Tree& tree, std::span<const Ray> rays, const Done& done) {
+    constexpr size_t kChunk = 4096;
+    constexpr size_t kPacket = Packet<kAnyHit, kExact>::kRays;
+    Packet<kAnyHit, kExact> packet(tree);
+    Stream<kAnyHit, kExact> stream(tree, rays);
+    uint32_t single[kChunk];
+    for (size_t begin = 0; begin < rays.size(); begin += kChunk) {
+        const size_t end = std::min(begin + kChunk, rays.size());
+        size_t singles = 0;
+        size_t i = begin;
+        for (; i + kPacket <= end; i += kPacket) {
+            if (packet.gather(&rays[i])) {
+                packet.trace();
+                for (size_t lane = 0; lane < kPacket; ++lane) {
+                    done(static_cast<uint32_t>(i + lane), packet.place(lane));
+                }
+            } else {
+                for (size_t lane = 0; lane < kPacket; ++lane) {
+                    single[singles++] = static_cast<uint32_t>(i + lane);
+                }
+            }
+        }
+        for (; i < end; ++i) {
+            single[singles++] = static_cast<uint32_t>(i);
+        }
+        stream.run({single, singles}, [&](const StreamRay& ray) { done(ray.number, ray.place); });
+    }
+}
+
+template <bool kExact>
+HWY_INLINE void intersect_all(const Tree& tree, std::span<const Ray> rays, std::span<Hit> hits) {
+    FinishQueue<kExact> queue(tree.blocks.data(), rays, hits);
+    trace<false, kExact>(tree, rays, [&](uint32_t ray, uint32_t place) {
+        if (place == kNoPlace) {
+            hits[ray] = missed(rays[ray]);
+        } else {
+            queue.add(ray, place);
+        }
+    });
+    queue.flush();
+}
+
+template <bool kExact>
+HWY_INLINE void occluded_all(const Tree& tree, std::span<const Ray> rays, std::span<uint8_t> results) {
+    trace<true, kExact>(tree, rays, [&](uint32_t ray, uint32_t place) { results[ray] = place != kNoPlace ? 1 : 0; });
+}
+
+}  // namespace espalier::HWY_NAMESPACE
+HWY_AFTER_NAMESPACE();
+#endif
