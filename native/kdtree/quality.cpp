@@ -47,9 +47,10 @@ class Checksum {
  private:
     template <class T>
     void add_bytes(const T& item) {
-        static_assert(sizeof(T) % sizeof(uint64_t) == 0);
-        uint64_t words[sizeof(T) / sizeof(uint64_t)];
-        std::memcpy(words, &item, sizeof(T));
+        constexpr size_t kBytes = sizeof(T);
+        static_assert(kBytes % sizeof(uint64_t) == 0);
+        uint64_t words[kBytes / sizeof(uint64_t)];
+        std::memcpy(words, &item, kBytes);
         for (const uint64_t word : words) {
             add_word(word);
         }

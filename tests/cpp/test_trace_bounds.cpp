@@ -369,7 +369,8 @@ TEST(DoubleBounds, OfSidesAndDistances) {
                 p[k] = to_double(aimed.corner[k]) - to_double(ray.origin);
             }
             for (int k = 0; k < 3; ++k) {
-                const Side side = measure_side(to_double(ray.direction), p[(k + 1) % 3], p[(k + 2) % 3]);
+                const Vec3d edge = to_double(aimed.corner[(k + 2) % 3]) - to_double(aimed.corner[(k + 1) % 3]);
+                const Side side = measure_side(to_double(ray.direction), p[(k + 1) % 3], edge);
                 side_share.add(side.value - truth.weight[k], side.error);
                 open += std::abs(side.value) <= side.error ? 1U : 0U;
             }
