@@ -179,8 +179,8 @@ class FinishQueue {
             const TriangleBlock& block = blocks_[place_[from] / kBlockSize];
             const uint32_t lane = place_[from] % kBlockSize;
             for (size_t axis = 0; axis < 3; ++axis) {
-                batch.origin[axis][i] = (&ray.origin.x)[axis];
-                batch.direction[axis][i] = (&ray.direction.x)[axis];
+                batch.origin[axis][i] = ray.origin[static_cast<int>(axis)];
+                batch.direction[axis][i] = ray.direction[static_cast<int>(axis)];
                 for (size_t k = 0; k < 3; ++k) {
                     batch.corner[k][axis][i] = block.vertex[k][axis][lane];
                 }

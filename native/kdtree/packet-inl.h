@@ -88,8 +88,8 @@ class Packet {
  private:
     using D = hn::CappedTag<float, 16>;
     using V = hn::Vec<D>;
-    static constexpr D d{};
-    static constexpr hn::RebindToUnsigned<D> du{};
+    static constexpr D d{};                         // NOLINT(readability-identifier-naming): as in functions
+    static constexpr hn::RebindToUnsigned<D> du{};  // NOLINT(readability-identifier-naming)
     static constexpr size_t kLanes = hn::MaxLanes(D());
     static constexpr size_t kCapacity = 70 * (WideNode::kWidth - 1) + 3 * WideNode::kWidth;
     /// Directions that differ by more are no packet.
@@ -129,14 +129,14 @@ class Packet {
                 const V way = field(lane, 4 + axis);
                 const V end = hn::Add(origin, way);
                 // The sum and the difference are off by u of their results.
-                const V off =
-                    hn::MulAdd(hn::Abs(end), hn::Set(d, 0x1p-23F),
-                               hn::Mul(hn::Abs(hn::Sub(end, hn::Set(d, (&focus.x)[axis]))), hn::Set(d, 1 + 0x1p-20F)));
+                const V off = hn::MulAdd(hn::Abs(end), hn::Set(d, 0x1p-23F),
+                                         hn::Mul(hn::Abs(hn::Sub(end, hn::Set(d, focus[static_cast<int>(axis)]))),
+                                                 hn::Set(d, 1 + 0x1p-20F)));
                 largest = hn::Max(largest, off);
                 hn::Store(hn::Neg(way), d, direction_[axis] + lane);
                 hn::Store(origin, d, origin_[axis] + lane);
             }
-            (&deviation.x)[axis] = hn::GetLane(hn::MaxOfLanes(d, largest)) + kTiny;
+            deviation[static_cast<int>(axis)] = hn::GetLane(hn::MaxOfLanes(d, largest)) + kTiny;
         }
         for (size_t lane = 0; lane < kRays; lane += kLanes) {
             if (!hn::AllTrue(d, hn::Le(field(lane, 7), hn::Set(d, 1.0F)))) {

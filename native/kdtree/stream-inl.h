@@ -192,7 +192,9 @@ class Stream {
         at_end_ += is_end ? 1 : 0;
         const auto node = reinterpret_cast<uintptr_t>(nodes_ + child);
         const auto block = reinterpret_cast<uintptr_t>(blocks_ + WideNode::first_block(child));
-        const auto* wanted = reinterpret_cast<const char*>(node ^ ((node ^ block) & (uintptr_t{0} - is_leaf)));
+        // A choice that compilers would make with a branch.
+        const auto* wanted = reinterpret_cast<const char*>(  // NOLINT(performance-no-int-to-ptr)
+            node ^ ((node ^ block) & (uintptr_t{0} - is_leaf)));
         for (int line = 0; line < 5; ++line) {
             __builtin_prefetch(wanted + 64 * line);
         }

@@ -2,6 +2,7 @@
 #include <gtest/gtest.h>
 
 #include <algorithm>
+#include <bit>
 #include <cstring>
 #include <numeric>
 #include <random>
@@ -142,7 +143,11 @@ TEST(Traversal, IsTheSameInAnyBatch) {
         std::vector<uint8_t> blocked(rays.size());
         intersect(tree, rays, hits);
         occluded(tree, rays, blocked);
-        const auto is_same = [](const Hit& a, const Hit& b) { return std::memcmp(&a, &b, sizeof(Hit)) == 0; };
+        const auto is_same = [](const Hit& a, const Hit& b) {
+            return std::bit_cast<uint32_t>(a.t) == std::bit_cast<uint32_t>(b.t) &&
+                   std::bit_cast<uint32_t>(a.u) == std::bit_cast<uint32_t>(b.u) &&
+                   std::bit_cast<uint32_t>(a.v) == std::bit_cast<uint32_t>(b.v) && a.triangle == b.triangle;
+        };
 
         size_t found = 0;
         size_t wrong_alone = 0;
