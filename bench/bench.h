@@ -30,7 +30,7 @@ struct Mode {
     Quality quality;
 };
 inline constexpr std::array kModes{Mode{"draft", Quality::kDraft}, Mode{"balanced", Quality::kBalanced},
-                                   Mode{"best", Quality::kBest}};
+                                   Mode{"best", Quality::kBest}, Mode{"exact", Quality::kExact}};
 constexpr size_t kDefaultMode = 1;
 
 /// How a mesh is looked at: a square pinhole picture and one point light.

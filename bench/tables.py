@@ -103,14 +103,12 @@ def quality_rows(meshes: list[tuple[str, dict[str, Any]]]) -> Iterable[Sequence[
             excess = (
                 f"{100 * (found['sah_block'] / modes['exact']['sah_block'] - 1):+.1f} %" if "exact" in modes else ""
             )
-            built = found["built_with"]
             yield (
                 mesh,
                 mode,
                 f"{found['sah_block']:.1f}",
                 excess,
                 f"{found['sah_classic']:.1f}",
-                f"{built['traversal']:g}, {built['block']:g}",
                 found["nodes"],
                 found["wide_nodes"],
                 f"{found['references_per_triangle']:.2f}",
@@ -260,7 +258,7 @@ def markdown(report: dict[str, Any]) -> str:
     for meshes in per_simd(report, "quality").values():
         head = (
             "mesh | mode | SAH cost, step 15 and block 12 | over exact | SAH cost, step 15 and triangle 20 | "
-            "built with | nodes | wide nodes | references per triangle | checksum"
+            "nodes | wide nodes | references per triangle | checksum"
         )
         parts += ["## Quality", table(head, quality_rows(meshes))]
     for meshes in per_simd(report, "memory").values():

@@ -141,7 +141,6 @@ def quality(sah: float) -> dict[str, Any]:
     return {
         "sah_block": sah,
         "sah_classic": 900.0,
-        "built_with": {"traversal": 15.0, "block": 12.0},
         "nodes": 7,
         "wide_nodes": 1,
         "references_per_triangle": 1.5,

@@ -403,7 +403,7 @@ def test_picture_is_the_same_for_any_number_of_threads_and_quality() -> None:
     what = scene([mesh(*bumpy_sheet(60))])
     expected = draw(what, BUSY_VIEW, BUSY_LIGHTS, (70, 50), (0.1, 0.2, 0.3), threads=1)
     assert len(np.unique(expected)) > 1000
-    for quality in ("draft", "balanced", "best"):
+    for quality in ("draft", "balanced", "best", "exact"):
         for threads in (1, 2, 3, 8):
             image = draw(what, BUSY_VIEW, BUSY_LIGHTS, (70, 50), (0.1, 0.2, 0.3), threads=threads, quality=quality)
             assert image.tobytes() == expected.tobytes(), (quality, threads)

@@ -14,9 +14,9 @@ import espalier_native
 import numpy as np
 import pytest
 
-from tests.native_kit import Floats, Ints, bumpy_sheet, nearest_hits, rays_through, real_mesh, sphere
+from tests.native_kit import Doubles, Floats, Ints, bumpy_sheet, nearest_hits, rays_through, real_mesh, sphere
 
-QUALITIES = ("draft", "balanced", "best")
+QUALITIES = ("draft", "balanced", "best", "exact")
 ONE_TRIANGLE = (np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32), np.array([[0, 1, 2]], np.int32))
 
 
@@ -99,6 +99,7 @@ def test_hits_do_not_depend_on_the_instruction_set(target: str) -> None:
         "vertices, triangles = bumpy_sheet(40)\n"
         "tree = e.build(vertices, triangles)\n"
         "hits = tree.intersect(*rays_through(vertices, 20000, seed=4))\n"
+        "print(*(e.build(vertices, triangles, q).report['checksum'] for q in ('draft', 'balanced', 'best', 'exact')))\n"
         "print(tree.report['checksum'], *(hashlib.sha256(hits[k]).hexdigest() for k in sorted(hits)))\n"
     )
 
@@ -109,6 +110,62 @@ def test_hits_do_not_depend_on_the_instruction_set(target: str) -> None:
         return subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=120).stdout
 
     assert run({"ESPALIER_SIMD": target}) == run({})
+
+
+def cost_of_plane(lower: Doubles, upper: Doubles, axis: int, plane: float) -> float:
+    """What it would cost to split all boxes there, in the builder's model."""
+
+    def area(size: Doubles) -> float:
+        return float(size[0] * size[1] + size[1] * size[2] + size[2] * size[0])
+
+    def blocks(references: int) -> float:
+        return float(np.ceil(references / 8)) if references <= 128 else references / 8
+
+    bottom, top = lower.min(0), upper.max(0)
+    is_left = lower[:, axis] < plane
+    is_right = ~is_left | (upper[:, axis] > plane)
+    left, right = top - bottom, top - bottom
+    left[axis], right[axis] = plane - bottom[axis], top[axis] - plane
+    children = area(left) * blocks(is_left.sum()) + area(right) * blocks(is_right.sum())
+    bonus = 1 if is_left.any() and is_right.any() else 0.9
+    return 15 + 12 * bonus * children / area(top - bottom)
+
+
+@pytest.mark.parametrize("count", [90, 120, 1000])
+@pytest.mark.parametrize("flat", [False, True])
+def test_exact_takes_the_cheapest_of_all_planes(count: int, flat: bool) -> None:
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        corners = rng.random((count, 1, 3)) + 0.1 * rng.random((count, 3, 3))
+        if flat:  # walls, which have no extent along an axis, in a few planes
+            corners[np.arange(count), :, rng.integers(0, 3, count)] = rng.integers(1, 9, (count, 1)) / 8
+        corners = corners.astype(np.float32)
+        triangles = np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
+        tree = espalier_native.build(corners.reshape(-1, 3), triangles, "exact")
+        root = int(tree.arrays()["nodes"][0])
+        axis, plane = root >> 32 & 3, float(np.array(root & 0xFFFFFFFF, np.uint32).view(np.float32))
+        lower, upper = corners.min(1), corners.max(1)
+        behind = np.nextafter(
+            upper, np.float32(2)
+        )  # what has no extent there lies before these, and behind its own end
+        events = [np.unique([lower[:, k], upper[:, k], behind[:, k]]).astype(np.float64) for k in range(3)]
+        lower, upper = lower.astype(np.float64), upper.astype(np.float64)
+        planes = [(k, x) for k in range(3) for x in events[k] if lower[:, k].min() < x < upper[:, k].max()]
+        least = min(cost_of_plane(lower, upper, k, x) for k, x in planes)
+        assert axis < 3, "so many references are no leaf"
+        assert cost_of_plane(lower, upper, axis, plane) == pytest.approx(least, rel=1e-5)
+
+
+@pytest.mark.parametrize("name", ["bunny", "armadillo", "sponza", "dragon"])
+def test_qualities_keep_their_promises_of_cost(name: str) -> None:
+    vertices, triangles = real_mesh(name)
+    reports = {quality: espalier_native.build(vertices, triangles, quality).report for quality in QUALITIES}
+    assert all(report["sah_constants"] == reports["exact"]["sah_constants"] for report in reports.values())
+    excess = {quality: report["sah_cost"] / reports["exact"]["sah_cost"] - 1 for quality, report in reports.items()}
+    assert 0 < excess["balanced"] <= 0.05
+    assert excess["balanced"] < excess["draft"] <= 0.12
+    # Greedy choices of the cheapest plane need not add up to the cheapest tree.
+    assert -0.01 <= excess["best"] <= 0.01
 
 
 def test_hit_is_the_point_that_u_and_v_name() -> None:
@@ -271,7 +328,7 @@ def test_build_refuses(vertices: Any, triangles: Any, error: type[Exception], sa
 
 
 def test_build_refuses_unknown_settings() -> None:
-    with pytest.raises(ValueError, match="quality must be 'draft', 'balanced' or 'best', not 'fast'"):
+    with pytest.raises(ValueError, match="quality must be 'draft', 'balanced', 'best' or 'exact', not 'fast'"):
         espalier_native.build(*ONE_TRIANGLE, quality="fast")
     for threads in (-1, 100_000):
         with pytest.raises(ValueError, match="threads must be between 0"):

@@ -202,8 +202,29 @@ HWY_INLINE hn::Vec<D> expected_blocks(D d, hn::Vec<DU> counts) {
     const auto whole = hn::ShiftRight<3>(hn::Add(counts, hn::Set(DU(), kBlockSize - 1)));
     const auto exact = hn::ConvertTo(d, hn::BitCast(di, whole));
     const auto fraction = hn::Mul(hn::ConvertTo(d, hn::BitCast(di, counts)), hn::Set(d, 1.0F / kBlockSize));
-    const auto is_small = hn::Lt(hn::BitCast(di, counts), hn::Set(di, static_cast<int32_t>(kSmallNode + 1)));
+    constexpr int32_t kFew = 128;
+    const auto is_small = hn::Lt(hn::BitCast(di, counts), hn::Set(di, kFew + 1));
     return hn::IfThenElse(hn::RebindMask(d, is_small), exact, fraction);
+}
+
+inline bool may_be_split(const OpenNode& node, const BuildParameters& parameters) {
+    return node.depth < parameters.sah.max_depth && CellShape(node.cell).is_splittable();
+}
+
+/// What leaves a node whole.
+inline Split leaf(const OpenNode& node, const BuildParameters& parameters) {
+    const hn::CappedTag<float, 16> d;
+    const auto blocks = expected_blocks(d, hn::Set(hn::RebindToUnsigned<decltype(d)>(), node.count));
+    return {-1, 0, static_cast<float>(parameters.sah.block) * hn::GetLane(blocks)};
+}
+
+/// True for planes that leave both sides together no more references than the node may have.
+template <class D, class DU = hn::RebindToUnsigned<D>>
+HWY_INLINE hn::Mask<D> is_affordable(D d, const OpenNode& node, hn::Vec<DU> left, hn::Vec<DU> right) {
+    const hn::RebindToSigned<D> di;
+    const auto too_many =
+        hn::Set(di, static_cast<int32_t>(std::min<uint64_t>(node.count + node.spare, kMostReferences) + 1));
+    return hn::RebindMask(d, hn::Lt(hn::BitCast(di, hn::Add(left, right)), too_many));
 }
 
 /// The costs of the planes from `first` on that cut [lower, upper] into slices.
@@ -211,23 +232,19 @@ template <class D>
 HWY_INLINE hn::Vec<D> slice_costs(D d, const SplitCosts<D>& costs, const OpenNode& node, int axis, float lower,
                                   float upper, const BinCounts& counts, int first) {
     const hn::RebindToUnsigned<D> du;
-    const hn::RebindToSigned<D> di;
     const auto left = hn::Load(du, counts.left[axis] + first);
     const auto right = hn::Sub(hn::Set(du, node.count), hn::Load(du, counts.ends_before[axis] + first));
-    const auto too_many =
-        hn::Set(di, static_cast<int32_t>(std::min<uint64_t>(node.count + node.spare, kMostReferences) + 1));
-    const auto is_affordable = hn::RebindMask(d, hn::Lt(hn::BitCast(di, hn::Add(left, right)), too_many));
     const auto position = slice_positions(d, lower, upper, first);
     const auto cost = costs(axis, position, expected_blocks(d, left), expected_blocks(d, right));
-    return hn::IfThenElse(is_affordable, cost, hn::Inf(d));
+    return hn::IfThenElse(is_affordable(d, node, left, right), cost, hn::Inf(d));
 }
 
 inline Split choose_split(const OpenNode& node, BinCounts& counts, const BuildParameters& parameters) {
     const hn::CappedTag<float, 16> d;
-    const CellShape shape(node.cell);
-    if (node.depth >= parameters.sah.max_depth || !shape.is_splittable()) {
+    if (!may_be_split(node, parameters)) {
         return {};
     }
+    const CellShape shape(node.cell);
     const SplitCosts costs(d, node, shape, parameters.sah);
     CheapestPlane cheapest(d);
     for (int axis = 0; axis < 3; ++axis) {
@@ -241,10 +258,7 @@ inline Split choose_split(const OpenNode& node, BinCounts& counts, const BuildPa
             cheapest.offer(axis * kPlanes + j, slice_costs(d, costs, node, axis, lower, upper, counts, j));
         }
     }
-    const hn::RebindToUnsigned<decltype(d)> du;
-    const auto leaf_cost =
-        static_cast<float>(parameters.sah.block) * hn::GetLane(expected_blocks(d, hn::Set(du, node.count)));
-    if (!(cheapest.cost() < leaf_cost)) {
+    if (!(cheapest.cost() < leaf(node, parameters).cost)) {
         return {};
     }
     const int axis = cheapest.index() / kPlanes;

@@ -13,8 +13,10 @@
 #include "kdtree/binning-inl.h"
 #include "kdtree/blocks-inl.h"
 #include "kdtree/bounds-inl.h"
+#include "kdtree/careful_node-inl.h"
 #include "kdtree/partition-inl.h"
 #include "kdtree/small_node-inl.h"
+#include "kdtree/split_search-inl.h"
 
 HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
@@ -28,8 +30,13 @@ class SubtreeBuilder {
     /// Builds below a node whose references begin at `begin`; from `room` on there is space for right children.
     void build(const OpenNode& node, size_t begin, size_t room) {
         const References references = at(begin);
-        if (node.count <= kSmallNode) {
-            const SmallNode<kSmallNode / 32> finish(references, node, *input_.parameters, output_);
+        const BuildParameters& parameters = *input_.parameters;
+        if (parameters.is_careful() && node.count <= CarefulNode::kCapacity) {
+            careful_node_.build(node, references);
+            return;
+        }
+        if (node.count <= parameters.small_node) {
+            finish_small_node(references, node, parameters, output_);
             return;
         }
         if (input_.cancel != nullptr && input_.cancel->load(std::memory_order_relaxed)) {
@@ -38,7 +45,7 @@ class SubtreeBuilder {
         if (input_.sharing != nullptr && input_.sharing->is_wanted()) {
             share();
         }
-        const Split split = find_split(node, references);
+        const Split split = search_(node, references);
         if (split.axis < 0) {
             write_leaf(node, references);
             return;
@@ -46,13 +53,12 @@ class SubtreeBuilder {
         Partition parts;
         size_t right_begin = begin;
         size_t right_room = room;
-        if (!cuts_empty_space(node, split, parts)) {
+        if (parameters.search == Search::kAllEvents || !cuts_empty_space(node, split, parts)) {
             if (room + node.count > input_.references->capacity()) {
                 build_elsewhere(node, references);
                 return;
             }
-            parts =
-                partition(*input_.soup, references, node.count, split, input_.parameters->clip, references, at(room));
+            parts = partition(*input_.soup, references, node.count, split, parameters.clip, references, at(room));
             right_begin = room;
             right_room = room + parts.right_count;
         }
@@ -80,7 +86,8 @@ class SubtreeBuilder {
 
  private:
     static constexpr uint32_t kNotGiven = 0xffffffffU;
-    static constexpr uint32_t kLeastToGive = 1024;  ///< references, below which giving costs more than it gains
+    static constexpr uint32_t kLeastToGive =
+        CarefulNode::kCapacity + 1;  ///< references, below which giving costs more than it gains
 
     /// A right child whose sibling is being built.
     struct Waiting {
@@ -90,19 +97,6 @@ class SubtreeBuilder {
     };
 
     References at(size_t place) const { return input_.references->references().at(place); }
-
-    Split find_split(const OpenNode& node, const References& references) const {
-        BinCounts counts{};
-        count_bins(references, node.count, node.tight, counts);
-        const Split split = choose_split(node, counts, *input_.parameters);
-        Interval range;
-        if (!finer_range(node, split, range)) {
-            return split;
-        }
-        BinCounts finer{};
-        count_bins_along(split.axis, references, node.count, range.lower, range.upper, finer);
-        return choose_finer_split(node, split, range, finer, *input_.parameters);
-    }
 
     /// Gives away the waiting node nearest to the root, which is the largest as a rule.
     void share() {
@@ -129,6 +123,8 @@ class SubtreeBuilder {
 
     const SubtreeInput& input_;
     SubtreeOutput& output_;
+    SplitSearch search_{*input_.parameters};
+    CarefulNode careful_node_{input_, search_, output_};
     std::vector<Waiting*> waiting_;  ///< from the root down
 };
 

@@ -10,14 +10,24 @@
 
 namespace espalier {
 
+/// Which planes are tried.
+enum class Search {
+    kSlices,       ///< those between equal slices of a node's tight box, and its ends
+    kFinerSlices,  ///< those between thinner slices around the cheapest of them, too
+    kEvents,       ///< the begins and ends of references' boxes around the cheapest of those, too
+    kAllEvents,    ///< all begins and ends
+};
+
 /// What the quality modes differ in.
 struct BuildParameters {
     SahConstants sah;
-    bool clip;  ///< whether straddlers' boxes are cut to the part of the triangle on each side
-};
+    Search search;
+    bool clip;            ///< whether straddlers' boxes are cut to the part of the triangle on each side
+    uint32_t small_node;  ///< a node of at most so many references is finished as bit masks (see small_node-inl.h)
+    uint32_t one_thread;  ///< a node of at most so many references is left to one thread, which may try its events
 
-/// A node of at most this many references is finished as one bit mask per plane and side.
-constexpr uint32_t kSmallNode = 128;
+    bool is_careful() const { return search == Search::kEvents || search == Search::kAllEvents; }
+};
 
 /// Along each axis the planes between so many slices of a node's tight box are tried, and both its ends: as many planes
 /// as the widest vector has lanes.

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 #include <algorithm>
 #include <chrono>
+#include <limits>
 #include <optional>
 
 #include "geometry/float_environment.h"
@@ -31,18 +32,19 @@ class Stopwatch {
 };
 
 BuildParameters parameters_of(Quality quality) {
-    BuildParameters parameters{{}, true};
+    SahConstants sah;
     switch (quality) {
         case Quality::kDraft:
-            parameters.clip = false;
-            parameters.sah.block = 8.0;
-            break;
+            sah.block = sah.traversal / 2;  // two blocks are a leaf without a search
+            return {sah, Search::kFinerSlices, false, 256, 256};
         case Quality::kBalanced:
-            break;
+            return {sah, Search::kFinerSlices, true, 128, 128};
         case Quality::kBest:
-            break;
+            return {sah, Search::kEvents, true, 32, 1U << 14};
+        case Quality::kExact:
+            return {sah, Search::kAllEvents, true, 0, std::numeric_limits<uint32_t>::max()};
     }
-    return parameters;
+    throw std::invalid_argument("no such quality");
 }
 
 /// The phases of a build, in order.
@@ -88,7 +90,6 @@ class Builder {
     }
 
     int threads() const { return threads_; }
-    const BuildParameters& parameters() const { return parameters_; }
 
  private:
     /// One thread needs no top levels: all references in one piece, and one subtree.
@@ -118,7 +119,6 @@ Tree build(const TriangleSoup& soup, const BuildOptions& options) {
     Tree tree = builder.build();
     tree.report.threads = builder.threads();
     tree.report.triangles = soup.size();
-    tree.report.sah_constants = builder.parameters().sah;
     measure_quality(tree, builder.threads());
     return tree;
 }

@@ -60,8 +60,9 @@ class SmallNode {
             const uint32_t left = node.count > 32 * w ? node.count - 32 * w : 0;
             all.word[w] = left >= 32 ? ~0U : (1U << left) - 1;
         }
-        split(all, node);
+        cost_ = split(all, node);
     }
+    float cost() const { return cost_; }  ///< per ray that meets the node's cell
 
  private:
     /// Per axis, word and plane: the references that begin before the plane, and those that end behind it.
@@ -71,7 +72,7 @@ class SmallNode {
     HWY_INLINE void place_planes(int axis, uint32_t count, const float* lowers, const float* uppers,
                                  const Box3f& tight) {
         const hn::CappedTag<float, 16> df;
-        const hn::CappedTag<int8_t, 64> d8;
+        const hn::CappedTag<int8_t, std::min(kCapacity, 64U)> d8;
         const float lower = tight.lower[axis];
         const float upper = tight.upper[axis];
         const Slices slices(lower, upper);
@@ -85,7 +86,7 @@ class SmallNode {
             std::memset(right, 0, sizeof right);
             return;
         }
-        Quantised<kCapacity> q;
+        Quantised<std::max(kCapacity, 64U)> q;
         quantise<true>(df, lowers, uppers, slices, kSlices, count, q);
         for (int j = 0; j < kPlanes; j += static_cast<int>(hn::Lanes(df))) {
             hn::Store(slice_positions(df, lower, upper, j), df, positions + j);
@@ -250,6 +251,7 @@ class SmallNode {
     const BuildParameters& parameters_;
     float traversal_cost_;
     float block_cost_;
+    float cost_;
     const uint32_t* triangles_;
     SubtreeOutput& output_;
     float reach_[3];
@@ -259,6 +261,19 @@ class SmallNode {
     alignas(64) float lowers_[kCapacity][4];
     alignas(64) float uppers_[kCapacity][4];
 };
+
+/// Finishes a node of at most parameters.small_node references; returns the cost of what was built.
+inline float finish_small_node(const References& references, const OpenNode& node, const BuildParameters& parameters,
+                               SubtreeOutput& output) {
+    switch (parameters.small_node) {
+        case 256:
+            return SmallNode<8>(references, node, parameters, output).cost();
+        case 128:
+            return SmallNode<4>(references, node, parameters, output).cost();
+        default:
+            return SmallNode<1>(references, node, parameters, output).cost();
+    }
+}
 
 }  // namespace espalier::HWY_NAMESPACE
 HWY_AFTER_NAMESPACE();

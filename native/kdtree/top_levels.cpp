@@ -94,7 +94,8 @@ std::vector<TopLevels::Part> TopLevels::parts_of(const std::vector<uint32_t>& no
 void TopLevels::split_above(uint32_t cut) {
     std::vector<uint32_t> level{0};
     for (;;) {
-        std::erase_if(level, [&](uint32_t node) { return nodes_[node].node.count <= std::max(cut, kSmallNode); });
+        std::erase_if(level,
+                      [&](uint32_t node) { return nodes_[node].node.count <= std::max(cut, parameters_.one_thread); });
         if (level.empty()) {
             return;
         }
@@ -114,6 +115,9 @@ void TopLevels::choose_splits(const std::vector<uint32_t>& level, const std::vec
     for_each_node(level, [&](TopNode& top, BinCounts& counts) {
         top.split = kernels_.choose_split(top.node, counts, parameters_);
     });
+    if (parameters_.search == Search::kSlices) {
+        return;
+    }
     count_parts(parts, [&](const TopNode& top, const Segment& segment, BinCounts& counts) {
         if (Interval range; finer_range(top.node, top.split, range)) {
             kernels_.count_bins_along(top.split.axis, segment.references, segment.count, range.lower, range.upper,

@@ -13,8 +13,8 @@
 
 namespace espalier {
 
-/// How the splits are searched, never what a ray may hit.
-enum class Quality { kDraft, kBalanced, kBest };
+/// How the splits are searched, never what a ray may hit. Exact is what the others are held against.
+enum class Quality { kDraft, kBalanced, kBest, kExact };
 
 struct BuildOptions {
     Quality quality = Quality::kBalanced;
@@ -74,9 +74,9 @@ struct BuildReport {
     uint64_t empty_leaves = 0;
     uint64_t references = 0;
     uint64_t wide_nodes = 0;
-    uint64_t bytes = 0;   ///< what the tree keeps: nodes, wide nodes and triangle blocks
-    double sah_cost = 0;  ///< block model, in the units of the constants, per ray that meets the scene's box
-    SahConstants sah_constants;
+    uint64_t bytes = 0;          ///< what the tree keeps: nodes, wide nodes and triangle blocks
+    double sah_cost = 0;         ///< block model, in the units of the constants, per ray that meets the scene's box
+    SahConstants sah_constants;  ///< of that cost: the same for every quality, even where its splits follow others
     uint64_t checksum = 0;  ///< of nodes, leaves and wide nodes: the same for every thread count and instruction set
     RejectedFaces rejected_faces;
 };

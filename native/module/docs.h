@@ -22,6 +22,7 @@ inline constexpr const char* kBuild = R"(Builds a kd-tree over triangles.
 
 vertices: float32 [N, 3], any values. triangles: int32 or uint32 [M, 3], indices into vertices.
 quality: 'draft', 'balanced' or 'best': how long to look for good splits, never what a ray hits.
+'exact' tries them all, for comparison with the others.
 threads: 0 for all; the tree is the same, bit for bit, for any number.
 Faces that are not finite, have no area or lie beyond 2^60 are counted in the report and left out.
 Raises TypeError for another dtype, ValueError for another shape, quality or number of threads,
@@ -35,7 +36,7 @@ inline constexpr const char* kReport = R"(What the build took and what came of i
 build_ms and phases_ms {bounds, top_levels, subtrees, compaction, layout}: wall-clock milliseconds.
 threads; triangles (as given); nodes; leaves; empty_leaves; references (of leaves to triangles);
 wide_nodes; bytes. sah_cost: expected cost of a ray that meets the scene's box, in the units of
-sah_constants. checksum: 16 hexadecimal digits, the same for any number of threads.
+sah_constants, which are the same for every quality. checksum: 16 hexadecimal digits, the same for any number of threads.
 rejected_faces {not_finite, no_area, too_large}: faces that no ray can hit, left out of the tree.)";
 
 inline constexpr const char* kIntersect =

@@ -62,7 +62,9 @@ Quality quality_from(const std::string& name) {
         return Quality::kBalanced;
     if (name == "best")
         return Quality::kBest;
-    throw py::value_error("quality must be 'draft', 'balanced' or 'best', not '" + name + "'");
+    if (name == "exact")
+        return Quality::kExact;
+    throw py::value_error("quality must be 'draft', 'balanced', 'best' or 'exact', not '" + name + "'");
 }
 
 py::dict report_dict(const BuildReport& report) {

@@ -66,7 +66,7 @@ TEST(Traversal, LosesNoHit) {
         const std::vector<Ray> rays = make_rays(mesh, 3000, 12);
         std::vector<Hit> expected(rays.size());
         intersect(list, rays, expected);
-        for (const Quality quality : {Quality::kDraft, Quality::kBalanced, Quality::kBest}) {
+        for (const Quality quality : {Quality::kDraft, Quality::kBalanced, Quality::kBest, Quality::kExact}) {
             const Tree tree = build(mesh.soup(), {quality, 1});
             std::vector<Hit> hits(rays.size());
             std::vector<uint8_t> blocked(rays.size());

@@ -11,7 +11,7 @@
 namespace espalier {
 namespace {
 
-constexpr Quality kQualities[] = {Quality::kDraft, Quality::kBalanced, Quality::kBest};
+constexpr Quality kQualities[] = {Quality::kDraft, Quality::kBalanced, Quality::kBest, Quality::kExact};
 
 template <class T>
 bool same_bytes(const LargeBuffer<T>& a, const LargeBuffer<T>& b) {
@@ -68,9 +68,12 @@ void for_each_leaf(const Tree& tree, const std::function<void(uint32_t, uint32_t
     }
 }
 
+/// Whether a box holds a point that was formed in double, and so may lie off its triangle by 2^-50 of its coordinates:
+/// far less than the margin of clipping, 2^-22 of them.
 bool contains(const Box3f& box, Vec3d p) {
+    const double rounding = 0x1p-49 * std::max({std::abs(p.x), std::abs(p.y), std::abs(p.z)});
     for (int axis = 0; axis < 3; ++axis) {
-        if (!(box.lower[axis] <= p[axis] && p[axis] <= box.upper[axis])) {
+        if (!(box.lower[axis] - rounding <= p[axis] && p[axis] <= box.upper[axis] + rounding)) {
             return false;
         }
     }
@@ -89,16 +92,14 @@ std::vector<Vec3d> crossings(const Vec3d (&corner)[3], const std::vector<KdNode>
             const double t = (split.split() - from[axis]) / edge[axis];
             if (t > 0 && t < 1) {
                 points.push_back(from + edge * (t * (1 - 0x1p-40)));
-                points.push_back(from + edge * (t * (1 + 0x1p-40)));
+                points.push_back(from + edge * std::min(t * (1 + 0x1p-40), 1.0));  // a plane may go through a corner
             }
         }
     }
     return points;
 }
 
-/// Points of every triangle lie in a box that holds the triangle: no clipping may cut anything away. A point formed in
-/// double is off the triangle by less than 2^-50 of its coordinates, the boxes' margin is 2^-22 of them; corners are
-/// exact.
+/// Points of every triangle lie in a box that holds the triangle: no clipping may cut anything away.
 void expect_everything_covered(const Mesh& mesh, const Tree& tree) {
     const TriangleSoup soup = mesh.soup();
     std::vector<std::vector<Box3f>> boxes(soup.size());
@@ -153,6 +154,7 @@ TEST(Tree, IsWellFormedAndCoversEveryTriangle) {
                            moved(make_soup(2000, 3), -3, 1e15F)};
     for (const Mesh& mesh : meshes) {
         for (const Quality quality : kQualities) {
+            SCOPED_TRACE(testing::Message() << "mesh " << &mesh - meshes << ", quality " << static_cast<int>(quality));
             const Tree tree = build(mesh.soup(), {quality, 1});
             expect_well_formed(tree);
             expect_everything_covered(mesh, tree);
@@ -252,9 +254,11 @@ TEST(Tree, BoundsItsReferencesOnHostileScenes) {
     }
     const Mesh meshes[] = {copies, coplanar, make_furball(60000)};
     for (const Mesh& mesh : meshes) {
-        const Tree tree = build(mesh.soup(), {Quality::kBalanced, 2});
-        EXPECT_LE(tree.report.references, uint64_t{7} * tree.report.triangles + 1024);
-        expect_well_formed(tree);
+        for (const Quality quality : kQualities) {
+            const Tree tree = build(mesh.soup(), {quality, 2});
+            EXPECT_LE(tree.report.references, uint64_t{7} * tree.report.triangles + 1024);
+            expect_well_formed(tree);
+        }
     }
     const Tree tree = build(copies.soup(), {Quality::kBalanced, 2});
     const Ray ray{{0.25F, 0.25F, -1}, 0, {0, 0, 1}, INFINITY};

@@ -1,0 +1,107 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+// The last references of a subtree where quality counts most: every node is searched, partitioned and clipped as large
+// ones are, and what does not pay in the end is taken back. Compiled once per instruction set (see build_kernels.cpp).
+
+#if defined(ESPALIER_KDTREE_CAREFUL_NODE_INL_H_) == defined(HWY_TARGET_TOGGLE)
+#ifdef ESPALIER_KDTREE_CAREFUL_NODE_INL_H_
+#undef ESPALIER_KDTREE_CAREFUL_NODE_INL_H_
+#else
+#define ESPALIER_KDTREE_CAREFUL_NODE_INL_H_
+#endif
+
+#include <hwy/highway.h>
+
+#include <deque>
+
+#include "kdtree/build_kernels.h"
+#include "kdtree/partition-inl.h"
+#include "kdtree/sah-inl.h"
+#include "kdtree/small_node-inl.h"
+#include "kdtree/split_search-inl.h"
+
+HWY_BEFORE_NAMESPACE();
+namespace espalier::HWY_NAMESPACE {
+namespace hn = hwy::HWY_NAMESPACE;
+
+/// Finishes a node that is too small to be shared by threads. Both children of a node lie in memory of their own,
+/// one pair for each depth, so that the node is still there when its split turns out not to pay.
+class CarefulNode {
+ public:
+    static constexpr uint32_t kCapacity = 1023;
+
+    CarefulNode(const SubtreeInput& input, SplitSearch& search, SubtreeOutput& output)
+        : input_(input),
+          search_(search),
+          output_(output),
+          traversal_cost_(static_cast<float>(input.parameters->sah.traversal)),
+          block_cost_(static_cast<float>(input.parameters->sah.block)) {}
+
+    /// Builds below a node; returns the cost of what was built, per ray that meets the cell.
+    float build(const OpenNode& node, const References& references, size_t level = 0) {
+        const float leaf_cost = block_cost_ * static_cast<float>(block_count(node.count));
+        if (leaf_cost <= traversal_cost_) {
+            write_leaf(node, references);
+            return leaf_cost;
+        }
+        if (node.count <= input_.parameters->small_node) {
+            return finish_small_node(references, node, *input_.parameters, output_);
+        }
+        const Split split = search_(node, references);
+        if (split.axis < 0) {
+            write_leaf(node, references);
+            return leaf_cost;
+        }
+        while (children_.size() <= level) {
+            children_.push_back({ReferenceBuffer(kCapacity), ReferenceBuffer(kCapacity)});
+        }
+        const References left_place = children_[level].left.references();
+        const References right_place = children_[level].right.references();
+        const Partition parts =
+            partition(*input_.soup, references, node.count, split, input_.parameters->clip, left_place, right_place);
+        OpenNode left;
+        OpenNode right;
+        open_children(node, split, parts, left, right);
+        const size_t first_triangle = output_.triangle_count();
+        const size_t index = output_.open_inner();
+        const float left_cost = build(left, left_place, level + 1);
+        const size_t right_child = output_.node_count();
+        const float right_cost = build(right, right_place, level + 1);
+
+        const hn::CappedTag<float, 16> d;
+        const CellShape shape(node.cell);
+        const SplitCosts costs(d, node, shape, input_.parameters->sah);
+        const auto area = [&](const OpenNode& child) {
+            return hn::GetLane(costs.relative_area(split.axis, hn::Set(d, child.cell.size()[split.axis])));
+        };
+        const float cost = traversal_cost_ + (area(left) * left_cost + area(right) * right_cost);
+        if (leaf_cost <= cost) {
+            output_.rewind(index, first_triangle);
+            write_leaf(node, references);
+            return leaf_cost;
+        }
+        output_.close_inner(index, split, right_child);
+        return cost;
+    }
+
+ private:
+    struct Children {
+        ReferenceBuffer left;
+        ReferenceBuffer right;
+    };
+
+    void write_leaf(const OpenNode& node, const References& references) {
+        std::copy_n(references.triangle, node.count, output_.add_leaf(node.count));
+        output_.last_box() = node.tight;
+    }
+
+    const SubtreeInput& input_;
+    SplitSearch& search_;
+    SubtreeOutput& output_;
+    float traversal_cost_;
+    float block_cost_;
+    std::deque<Children> children_;
+};
+
+}  // namespace espalier::HWY_NAMESPACE
+HWY_AFTER_NAMESPACE();
+#endif
