@@ -163,8 +163,10 @@ struct alignas(64) TracedRay {
         x = kx * kBlockSize;
         y = ky * kBlockSize;
         z = kz * kBlockSize;
-        const float* o = &given.origin.x;
-        const float* along = &given.direction.x;
+        alignas(16) float o[4];
+        alignas(16) float along[4];
+        hn::Store(origin, d, o);
+        hn::Store(direction, d, along);
         ox = o[kx];
         oy = o[ky];
         oz = o[kz];
