@@ -5,9 +5,8 @@ from __future__ import annotations
 
 import itertools
 import json
-import subprocess
+import runpy
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -185,14 +184,9 @@ def test_the_command_needs_a_checkout(tmp_path: Path, monkeypatch: pytest.Monkey
     from addon import cli
 
     started: list[list[str]] = []
-
-    def run(words: list[str], **_: Any) -> Any:
-        started.append(words)
-        return SimpleNamespace(returncode=0)
-
-    monkeypatch.setattr(subprocess, "run", run)
+    monkeypatch.setattr(runpy, "run_module", lambda name: {"main": lambda words: started.append([name, *words])})
     assert cli.main(["report", "--quick", "--output", str(tmp_path)]) == 0
-    assert started[0][1:] == ["-m", "tools.report", "--quick", "--output", str(tmp_path)]
+    assert started == [["tools.report", "--quick", "--output", str(tmp_path)]]
     monkeypatch.setattr(cli, "CHECKOUT", tmp_path)
     assert cli.command(["report"]) == 1
     assert "needs a checkout" in capsys.readouterr().err
