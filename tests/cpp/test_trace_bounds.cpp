@@ -473,10 +473,9 @@ TEST(PacketBounds, LoseAndInventNothing) {
                 continue;
             }
             // Near a triangle that lies far out, ends differ by more than the test from there is off otherwise.
-            const Vec3f size = aimed.corner[1] - aimed.corner[0];
-            const Vec3f focus = random.below(2) == 0
-                                    ? aimed.ray.origin
-                                    : aimed.corner[0] + Vec3f{size.y, size.z, size.x} * random.fraction();
+            const Vec3f side = aimed.corner[1] - aimed.corner[0];
+            const float size = std::max({std::abs(side.x), std::abs(side.y), std::abs(side.z)});
+            const Vec3f focus = random.below(2) == 0 ? aimed.ray.origin : aimed.corner[0] + random.point(3, 4) * size;
             const std::vector<float> positions{aimed.corner[0].x, aimed.corner[0].y, aimed.corner[0].z,
                                                aimed.corner[1].x, aimed.corner[1].y, aimed.corner[1].z,
                                                aimed.corner[2].x, aimed.corner[2].y, aimed.corner[2].z};
@@ -484,11 +483,14 @@ TEST(PacketBounds, LoseAndInventNothing) {
             const Tree tree = build({positions, triangle}, {Quality::kBalanced, 1});
             std::vector<Ray> rays;
             const bool ends_together = random.below(2) == 0;
+            // Beside one edge, or all of them, by no more than coordinates are rounded out there.
+            const uint32_t edges = random.below(2) == 0 ? 1 : 3;
+            const Vec3d beside = to_double(random.point(-1, 0)) * (length(to_double(focus)) * 0x1p-25);
             for (int n = 0; n < 32; ++n) {
-                const uint32_t k = random.below(3);
+                const uint32_t k = random.below(edges);
                 const double along = random.fraction();
                 const Vec3d target =
-                    to_double(aimed.corner[k]) * along + to_double(aimed.corner[(k + 1) % 3]) * (1 - along);
+                    to_double(aimed.corner[k]) * along + to_double(aimed.corner[(k + 1) % 3]) * (1 - along) + beside;
                 const Vec3d to_target = target - to_double(focus);
                 const Vec3f direction = to_float(to_target * (ends_together ? -2.0 : 0x1p-3));
                 if (std::abs(direction[largest_axis(direction)]) < 0x1p-100F) {
