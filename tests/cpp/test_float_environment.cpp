@@ -117,7 +117,7 @@ TEST(FloatEnvironment, ProductsAreRoundedBeforeTheyAreAdded) {
         GTEST_SKIP() << "this processor has no fused operations";
     }
 #endif
-    const double a = 1 + 0x1p-30;
+    volatile double a = 1 + 0x1p-30;  // known at run time only
     EXPECT_EQ(multiply_and_add(a, a, -(1 + 0x1p-29)), 0);
     EXPECT_EQ(std::fma(a, a, -(1 + 0x1p-29)), 0x1p-60) << "what a fused operation gives";
 }
