@@ -112,7 +112,7 @@ def ask(case: str, rays: int, seed: int = 0) -> Question:
     whole = judge_rays(vertices, triangles, origins, directions)
     t_min = np.zeros(len(origins), np.float32)
     # What was aimed at lies at 1, or an ulp beside it.
-    t_max = np.resize(np.repeat(np.array([np.inf, 1, 1, 0.99], np.float32), PACKET), len(origins))
+    t_max = np.resize(np.repeat(np.array([np.inf, 1, 1, 0.99, 1], np.float32), PACKET), len(origins))
 
     with np.errstate(over="ignore"):
         nearest = whole.t.astype(np.float32)

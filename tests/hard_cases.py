@@ -34,7 +34,9 @@ def make(name: str, rays: int, seed: int = 0) -> Case:
     origins, directions = origins[kept], directions[kept]
 
     points, aims = packets_of(origins, directions)
-    both = np.stack([np.stack([points, aims - points], 2), np.stack([aims, points - aims], 2)], 1)
+    # Lamps are met within rounding: half of them not in one point.
+    ends = points + np.spacing(points) * rng.integers(-3, 4, points.shape) * (np.arange(len(points)) % 2)[:, None, None]
+    both = np.stack([np.stack([points, aims - points], 2), np.stack([aims, ends.astype(np.float32) - aims], 2)], 1)
     packets = both.reshape(-1, PACKET, 2, 3)
     sound = packets[np.all(is_taken(packets[:, :, 0], packets[:, :, 1]), axis=1)].reshape(-1, 2, 3)
     return vertices, triangles, np.vstack([origins, sound[:, 0]]), np.vstack([directions, sound[:, 1]])
@@ -298,6 +300,20 @@ def in_face_planes(rng: Generator, count: int) -> Case:
     return rounded((vertices, triangles, origins, directions))
 
 
+def fans_along_a_face(rng: Generator, count: int) -> Case:
+    """Rays from one point within a plane that boxes touch from below only: whoever tilts them a little misses all."""
+    places = np.column_stack([np.full(40, -1.0), rng.integers(-6, 6, (40, 2))])
+    vertices, triangles = boxes(places)
+    on_edges = vertices[rng.integers(len(vertices), size=count)]
+    on_edges[:, 1:] += rng.choice([0, 0, 0.25, -0.5], size=(count, 2))
+    on_edges[:, 0] = 0
+    eyes = np.column_stack([np.zeros(12), rng.normal(size=(12, 2)) * 9]).astype(np.float32)
+    origins = eyes[np.sort(rng.integers(12, size=count))]
+    axis = int(rng.integers(3))
+    vertices, origins, on_edges = (np.roll(points, axis, axis=1) for points in (vertices, origins, on_edges))
+    return rounded((vertices, triangles, origins, on_edges - origins))
+
+
 def at_cell_corners(rng: Generator, count: int) -> Case:
     """Slanted rays through the corners of a grid of boxes: two planes of different axes are met in one rounding."""
     places = np.array([[x, y, z] for x in range(3) for y in range(3) for z in range(3)]) * 1.1
@@ -305,14 +321,19 @@ def at_cell_corners(rng: Generator, count: int) -> Case:
     return rounded((vertices, triangles, *rays_at(vertices, rng, count, 1.5)))
 
 
-def touched_at_a_corner(rng: Generator, count: int) -> Case:
+def touched_at_a_corner(rng: Generator, count: int, width: float = 100.0) -> Case:
     """From zero at the corners of leaves beside the ray: it enters where it leaves, each rounded in its own way."""
-    corner = rng.normal(size=(80, 1, 1, 3)).astype(np.float32)
+    corner = (rng.normal(size=(80, 1, 1, 3)) * width + [40, 60, 100]).astype(np.float32)
     side = rng.choice([-1, 1], size=(80, 1, 1, 3)) * 10.0 ** rng.uniform(-5, -1, size=(80, 1, 1, 1))
-    beside = corner + side * rng.random((80, 8, 2, 3))
+    beside = corner * (1 + side * rng.random((80, 8, 2, 3)))
     vertices, triangles = loose(np.concatenate([np.repeat(corner, 8, axis=1), beside], axis=2))
     directions = corner[rng.integers(80, size=count), 0, 0] * rng.choice([0.5, 1, 4, 3], size=(count, 1))
     return rounded((vertices, triangles, np.zeros((count, 3)), directions))
+
+
+def touched_in_a_packet(rng: Generator, count: int) -> Case:
+    """The same within a narrow cone, so that the rays make packets: one ray alone touches the box."""
+    return touched_at_a_corner(rng, count, 5.0)
 
 
 def flat_grid(rng: Generator, count: int) -> Case:
@@ -705,26 +726,61 @@ CASES: dict[str, MakeCase] = {
     **{
         case.__name__: case
         for case in (
-            *(at_vertices, nested_cylinders, at_edges, whole_numbers, glancing_edges, through_two_seams, twisted_quads),
-            *(axis_parallel, down_on_heights, negative_zero, in_face_planes, at_cell_corners, touched_at_a_corner),
-            *(
-                flat_grid,
-                stacked_boxes,
-                floor_between,
-                needle_fan,
-                grazing_slivers,
-                tiny_in_a_room,
-                no_area,
-                not_finite,
-            ),
-            *(stacked_copies, no_way_to_split, coincident_pairs, coplanar_overlap, lattice, furball, splits_near_zero),
-            *(nearly_touching, deep_tree, one_triangle, two_triangles, far_origins, small_and_far, small_beside_huge),
-            *(from_the_surface, thin_skin, just_ahead, low_poly_shadow, nearly_coplanar, crossing_sheets),
-            *(near_degenerate, ulps_apart, any_magnitude, any_length, almost_in_plane, subnormal, subnormal_among_ones),
+            at_vertices,
+            nested_cylinders,
+            at_edges,
+            whole_numbers,
+            glancing_edges,
+            through_two_seams,
+            twisted_quads,
+            axis_parallel,
+            down_on_heights,
+            negative_zero,
+            in_face_planes,
+            fans_along_a_face,
+            at_cell_corners,
+            touched_at_a_corner,
+            touched_in_a_packet,
+            flat_grid,
+            stacked_boxes,
+            floor_between,
+            needle_fan,
+            grazing_slivers,
+            tiny_in_a_room,
+            no_area,
+            not_finite,
+            stacked_copies,
+            no_way_to_split,
+            coincident_pairs,
+            coplanar_overlap,
+            lattice,
+            furball,
+            splits_near_zero,
+            nearly_touching,
+            deep_tree,
+            one_triangle,
+            two_triangles,
+            far_origins,
+            small_and_far,
+            small_beside_huge,
+            from_the_surface,
+            thin_skin,
+            just_ahead,
+            low_poly_shadow,
+            nearly_coplanar,
+            crossing_sheets,
+            near_degenerate,
+            ulps_apart,
+            any_magnitude,
+            any_length,
+            almost_in_plane,
+            subnormal,
+            subnormal_among_ones,
         )
     },
     "at_vertices_moved_1e3": moved(at_vertices, 1e3),
     "at_vertices_moved_1e5": moved(at_vertices, 1e5),
+    "touched_at_a_corner_moved_1e3": moved(touched_at_a_corner, 1e3),
     "at_vertices_moved_1e7": moved(at_vertices, 1e7),
     "axis_parallel_moved_1e5": moved(axis_parallel, 1e5),
     "at_edges_scaled_2e-20": scaled(at_edges, 2e-20),
