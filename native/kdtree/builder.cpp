@@ -40,7 +40,7 @@ BuildParameters parameters_of(Quality quality) {
         case Quality::kBalanced:
             return {sah, Search::kFinerSlices, true, 128, 128};
         case Quality::kBest:
-            return {sah, Search::kEvents, true, 32, 1U << 14};
+            return {sah, Search::kEvents, true, 48, 1U << 14};
         case Quality::kExact:
             return {sah, Search::kAllEvents, true, 0, std::numeric_limits<uint32_t>::max()};
     }

@@ -11,8 +11,6 @@
 
 #include <hwy/highway.h>
 
-#include <deque>
-
 #include "kdtree/build_kernels.h"
 #include "kdtree/partition-inl.h"
 #include "kdtree/sah-inl.h"
@@ -23,8 +21,8 @@ HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
 namespace hn = hwy::HWY_NAMESPACE;
 
-/// Finishes a node that is too small to be shared by threads. Both children of a node lie in memory of their own,
-/// one pair for each depth, so that the node is still there when its split turns out not to pay.
+/// Finishes a node that is too small to be shared by threads. Both children of a node lie behind it, so that the node
+/// is still there when its split turns out not to pay.
 class CarefulNode {
  public:
     static constexpr uint32_t kCapacity = 1023;
@@ -36,8 +34,9 @@ class CarefulNode {
           traversal_cost_(static_cast<float>(input.parameters->sah.traversal)),
           block_cost_(static_cast<float>(input.parameters->sah.block)) {}
 
-    /// Builds below a node; returns the cost of what was built, per ray that meets the cell.
-    float build(const OpenNode& node, const References& references, size_t level = 0) {
+    /// Builds below a node; returns the cost of what was built, per ray that meets the cell. From `room` on there is
+    /// space for its children.
+    float build(const OpenNode& node, const References& references, size_t room = 0) {
         const float leaf_cost = block_cost_ * static_cast<float>(block_count(node.count));
         if (leaf_cost <= traversal_cost_) {
             write_leaf(node, references);
@@ -51,11 +50,12 @@ class CarefulNode {
             write_leaf(node, references);
             return leaf_cost;
         }
-        while (children_.size() <= level) {
-            children_.push_back({ReferenceBuffer(kCapacity), ReferenceBuffer(kCapacity)});
+        const size_t right_room = room + node.count + kMargin;
+        if (right_room + node.count > children_.capacity()) {
+            return CarefulNode(input_, search_, output_).build(node, references);
         }
-        const References left_place = children_[level].left.references();
-        const References right_place = children_[level].right.references();
+        const References left_place = children_.references().at(room);
+        const References right_place = children_.references().at(right_room);
         const Partition parts =
             partition(*input_.soup, references, node.count, split, input_.parameters->clip, left_place, right_place);
         OpenNode left;
@@ -63,9 +63,10 @@ class CarefulNode {
         open_children(node, split, parts, left, right);
         const size_t first_triangle = output_.triangle_count();
         const size_t index = output_.open_inner();
-        const float left_cost = build(left, left_place, level + 1);
+        const size_t next_room = right_room + right.count;
+        const float left_cost = build(left, left_place, next_room);
         const size_t right_child = output_.node_count();
-        const float right_cost = build(right, right_place, level + 1);
+        const float right_cost = build(right, right_place, next_room);
 
         const hn::CappedTag<float, 16> d;
         const CellShape shape(node.cell);
@@ -84,10 +85,7 @@ class CarefulNode {
     }
 
  private:
-    struct Children {
-        ReferenceBuffer left;
-        ReferenceBuffer right;
-    };
+    static constexpr uint32_t kMargin = 16;  ///< references that vector code may write past the end
 
     void write_leaf(const OpenNode& node, const References& references) {
         std::copy_n(references.triangle, node.count, output_.add_leaf(node.count));
@@ -99,7 +97,7 @@ class CarefulNode {
     SubtreeOutput& output_;
     float traversal_cost_;
     float block_cost_;
-    std::deque<Children> children_;
+    ReferenceBuffer children_{size_t{8} * kCapacity};  ///< rarely half of it is used
 };
 
 }  // namespace espalier::HWY_NAMESPACE

@@ -15,7 +15,6 @@
 #include <bit>
 #include <limits>
 #include <utility>
-#include <vector>
 
 #include "kdtree/binning-inl.h"
 #include "kdtree/build_kernels.h"
@@ -38,15 +37,14 @@ HWY_INLINE hn::Vec<DI> sort_keys_of(DI di, hn::Vec<DI> bits) {
 inline float from_sort_key(int32_t key) { return std::bit_cast<float>(key ^ ((key >> 31) & 0x7fffffff)); }
 
 /// Sorts the first `count` keys: by radix, if they are enough for that to pay.
-inline void sort_keys(std::vector<int32_t>& keys, uint32_t count, std::vector<int32_t>& scratch) {
+inline void sort_keys(LargeBuffer<int32_t>& keys, uint32_t count, LargeBuffer<int32_t>& scratch) {
     constexpr uint32_t kWorthRadix = 256;
     constexpr uint32_t kBits = 8;
     constexpr uint32_t kBuckets = 1U << kBits;
     if (count < kWorthRadix) {
-        std::sort(keys.begin(), keys.begin() + count);
+        std::sort(keys.data(), keys.data() + count);
         return;
     }
-    scratch.resize(keys.size());
     const auto digit_of = [](int32_t key, uint32_t digit) {
         return ((static_cast<uint32_t>(key) ^ 0x80000000U) >> (kBits * digit)) % kBuckets;
     };
@@ -64,7 +62,7 @@ inline void sort_keys(std::vector<int32_t>& keys, uint32_t count, std::vector<in
         for (uint32_t i = 0; i < count; ++i) {
             scratch[counts[digit][digit_of(keys[i], digit)]++] = keys[i];
         }
-        keys.swap(scratch);
+        std::swap(keys, scratch);
     }
 }
 
@@ -89,8 +87,9 @@ class EventSweep {
         const auto lanes = static_cast<uint32_t>(hn::Lanes(d));
         const auto a = static_cast<size_t>(axis);
         if (begins_.size() < count + lanes) {
-            begins_.resize(count + lanes);
-            ends_.resize(count + lanes);
+            for (LargeBuffer<int32_t>* keys : {&begins_, &ends_, &scratch_}) {
+                *keys = LargeBuffer<int32_t>(count + lanes);
+            }
         }
         const auto first = hn::Set(di, sort_key(range.lower));
         const auto last = hn::Set(di, sort_key(range.upper));
@@ -163,9 +162,9 @@ class EventSweep {
         }
     }
 
-    std::vector<int32_t> begins_;
-    std::vector<int32_t> ends_;
-    std::vector<int32_t> scratch_;
+    LargeBuffer<int32_t> begins_;
+    LargeBuffer<int32_t> ends_;
+    LargeBuffer<int32_t> scratch_;
     uint32_t begin_count_ = 0;
     uint32_t end_count_ = 0;
     uint32_t begun_ = 0;

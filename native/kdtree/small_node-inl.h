@@ -72,7 +72,7 @@ class SmallNode {
     HWY_INLINE void place_planes(int axis, uint32_t count, const float* lowers, const float* uppers,
                                  const Box3f& tight) {
         const hn::CappedTag<float, 16> df;
-        const hn::CappedTag<int8_t, std::min(kCapacity, 64U)> d8;
+        const hn::CappedTag<int8_t, 64> d8;
         const float lower = tight.lower[axis];
         const float upper = tight.upper[axis];
         const Slices slices(lower, upper);
@@ -86,7 +86,7 @@ class SmallNode {
             std::memset(right, 0, sizeof right);
             return;
         }
-        Quantised<std::max(kCapacity, 64U)> q;
+        Quantised<kCapacity> q;
         quantise<true>(df, lowers, uppers, slices, kSlices, count, q);
         for (int j = 0; j < kPlanes; j += static_cast<int>(hn::Lanes(df))) {
             hn::Store(slice_positions(df, lower, upper, j), df, positions + j);
@@ -271,7 +271,7 @@ inline float finish_small_node(const References& references, const OpenNode& nod
         case 128:
             return SmallNode<4>(references, node, parameters, output).cost();
         default:
-            return SmallNode<1>(references, node, parameters, output).cost();
+            return SmallNode<2>(references, node, parameters, output).cost();
     }
 }
 
