@@ -36,7 +36,15 @@ from tests.judge import Floats, Ints
 ROOT = Path(__file__).resolve().parent.parent
 
 # Cases whose rays are nearly all decided by expansions.
-SLOW = {"any_magnitude", "near_degenerate_scaled_1e-30", "small_and_far", "splits_near_zero", "ulps_apart"}
+SLOW = {
+    "any_length",
+    "any_magnitude",
+    "near_degenerate_scaled_1e-30",
+    "small_and_far",
+    "splits_near_zero",
+    "subnormal",
+    "ulps_apart",
+}
 
 
 @dataclass(frozen=True)

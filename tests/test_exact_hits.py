@@ -11,7 +11,7 @@ import pytest
 from tests.exactness import SLOW, WAYS, ask, qualities, trace_everywhere, tracers
 from tests.hard_cases import CASES
 
-RAYS = {case: 4_000 if case in SLOW else 24_000 for case in CASES}
+RAYS = {case: 4_000 if case in SLOW else 20_000 for case in CASES}
 
 JUDGED: dict[str, int] = {}
 
