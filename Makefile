@@ -78,7 +78,7 @@ report: native build/bench/bench.json
 	@tools/need $(TEST_SYSTEM)
 	@tools/environment .venv "3.11 3.13" -r requirements/test.txt
 	cmake --preset release -DESPALIER_TESTS=ON
-	cmake --build --preset release -j $(JOBS) --target espalier_judge
+	cmake --build --preset release -j $(JOBS) --target espalier_judge espalier_plain
 	python -m addon report $(REPORT)
 
 build/bench/bench.json:

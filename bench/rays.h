@@ -8,6 +8,7 @@
 #include <random>
 
 #include "bench.h"
+#include "kdtree/plain_traversal.h"
 #include "kdtree/traversal.h"
 
 namespace espalier::bench {
@@ -131,15 +132,23 @@ double trace_chunks(const RaySet& set, int threads, const TraceChunk& trace_chun
     return watch.ms();
 }
 
-/// Our tracer on a set; `hits` or `blocked` has as many places as the set has rays.
-inline double trace_ours(const Tree& tree, const RaySet& set, int threads, std::vector<Hit>& hits,
-                         std::vector<uint8_t>& blocked) {
+/// What our tracer finds of a set.
+struct Found {
+    std::vector<Hit> hits;
+    std::vector<uint8_t> blocked;
+
+    explicit Found(const RaySet& set)
+        : hits(set.any_hit ? 0 : set.rays.size()), blocked(set.any_hit ? set.rays.size() : 0) {}
+};
+
+/// Our tracer on a set, or what it would be without that which makes hits exact.
+inline double trace_ours(const Tree& tree, const RaySet& set, int threads, Found& found, bool is_exact = true) {
     return trace_chunks(set, threads, [&](size_t first, size_t count) {
         const auto rays = std::span(set.rays).subspan(first, count);
         if (set.any_hit) {
-            occluded(tree, rays, std::span(blocked).subspan(first, count));
+            (is_exact ? occluded : plain_occluded)(tree, rays, std::span(found.blocked).subspan(first, count));
         } else {
-            intersect(tree, rays, std::span(hits).subspan(first, count));
+            (is_exact ? intersect : plain_intersect)(tree, rays, std::span(found.hits).subspan(first, count));
         }
     });
 }

@@ -36,12 +36,10 @@ Json scale_build(const Mesh& mesh, const Mode& mode, double seconds) {
 }
 
 Json scale_rays(const Tree& tree, const RaySet& set, double seconds) {
-    std::vector<Hit> hits(set.rays.size());
-    std::vector<uint8_t> blocked(set.rays.size());
+    Found found(set);
     std::vector<Contestant> contestants;
     for (const int threads : thread_counts()) {
-        contestants.emplace_back(set.name, threads,
-                                 [&, threads] { return trace_ours(tree, set, threads, hits, blocked); });
+        contestants.emplace_back(set.name, threads, [&, threads] { return trace_ours(tree, set, threads, found); });
     }
     take_turns(contestants, seconds);
     return {{"what", std::string("rays, ") + set.name}, {"rows", rows_of(contestants)}};

@@ -9,6 +9,7 @@ from typing import Any
 
 Times = Sequence[float]  # milliseconds of each turn
 DEFAULT_MODE = "balanced"
+NOT_EXACT = "not exact"  # the same tracer, on the same tree, without what makes hits exact
 
 ABOUT = (
     "Contestants take turns in one process. Times are medians (least to greatest); ratios are medians of the ratios "
@@ -47,6 +48,13 @@ def efficiency(times: dict[tuple[str, int], Times], name: str, threads: int) -> 
     if threads == 1 or (name, 1) not in times:
         return ""
     return f"{median(ratios(times[name, 1], times[name, threads])) / threads:.2f}"
+
+
+def price(times: dict[tuple[str, int], Times], threads: int) -> str:
+    """By how much the default mode is slower for exact hits than the same tracer without its safeguards"""
+    if (NOT_EXACT, threads) not in times:
+        return ""
+    return f"{100 * (1 - median(ratios(times[NOT_EXACT, threads], times[DEFAULT_MODE, threads]))):.1f} %"
 
 
 def per_simd(report: dict[str, Any], part: str) -> dict[str, list[tuple[str, dict[str, Any]]]]:
@@ -157,11 +165,12 @@ def ray_table(meshes: list[tuple[str, dict[str, Any]]]) -> str:
                 group["rays"],
                 *map(cell, names),
                 f"{median(gain):.2f} ({min(gain):.2f} to {max(gain):.2f})",
+                price(times, threads),
                 efficiency(times, DEFAULT_MODE, threads),
                 group["differ"],
             )
         )
-    ends = [f"{DEFAULT_MODE} to the better of Embree's", "efficiency", "other face than Embree"]
+    ends = [f"{DEFAULT_MODE} to the better of Embree's", "price of exactness", "efficiency", "other face than Embree"]
     return table(" | ".join(["mesh", "rays", "number", *names, *ends]), rows)
 
 

@@ -51,6 +51,10 @@ def library() -> ctypes.CDLL:
     return ctypes.CDLL(str(BUILT))
 
 
+def address(array: NDArray[Any]) -> ctypes.c_void_p:
+    return ctypes.c_void_p(array.ctypes.data)
+
+
 def judge_rays(
     vertices: Floats,
     triangles: Ints,
@@ -67,10 +71,6 @@ def judge_rays(
     assert len(faces) == 0 or (faces.min() >= 0 and faces.max() < len(vertices))
     triangle = np.empty(count, np.int32)
     t, u, v = np.empty((3, count))
-
-    def address(array: NDArray[Any]) -> ctypes.c_void_p:
-        return ctypes.c_void_p(array.ctypes.data)
-
     library().espalier_judge(
         address(inputs[0]),
         ctypes.c_size_t(len(vertices)),

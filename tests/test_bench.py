@@ -175,8 +175,15 @@ def test_rays_are_compared_with_the_faster_of_embrees_calls() -> None:
     group["rows"][0]["steps"] = {"nodes": 2.25, "blocks": 1.125}
     text = markdown(report_of(rays=[group], threads=2))
     row = cells(text, "bunny", "primary")
-    assert row[2:] == ["20000", "1.33 (2.2, 1.1)", "0.44", "1.33", "1.12 (0.75 to 1.50)", "0.95", "3"]
+    assert row[2:] == ["20000", "1.33 (2.2, 1.1)", "0.44", "1.33", "1.12 (0.75 to 1.50)", "", "0.95", "3"]
     assert "| number | balanced | Embree single | Embree packets of 8 |" in text
+
+
+def test_price_is_the_share_of_speed_that_exactness_takes() -> None:
+    """The machine is slow in the second turn"""
+    group = group_of(2, balanced=[10, 20], not_exact=[9, 18], Embree_single=[30, 60])
+    text = markdown(report_of(rays=[{**group, "set": "primary", "rays": 20_000, "differ": 0}], threads=2))
+    assert cells(text, "bunny", "primary")[-3] == "10.0 %"
 
 
 def test_call_that_a_set_was_not_traced_with_is_left_blank() -> None:

@@ -125,6 +125,7 @@ def test_ours_is_exact_and_the_peers_are_not(tmp_path: Path) -> None:
         assert 0.0 < row["mrays_per_s_min"] <= row["mrays_per_s"] <= row["mrays_per_s_max"]
     for kind in ("lost", "false", "wrong_face"):
         assert rows["Espalier"][f"{kind}_per_million"] == 0.0
+        assert rows["Espalier without safeguards"][f"{kind}_per_million"] > 0.0
         assert rows["Embree, robust"][f"{kind}_per_million"] > 0.0
         assert rows["Blender's BVHTree"][f"{kind}_per_million"] > 0.0
     assert rows["Espalier"]["t_error_ulps_max"] <= 1.0

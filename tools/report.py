@@ -8,12 +8,14 @@ that are not measured again stay as they were. All seeds are fixed.
 from __future__ import annotations
 
 import argparse
+import ctypes
 import importlib
 import json
 import os
 import sys
 import tempfile
 import time
+import weakref
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -33,13 +35,14 @@ from addon.export import SceneArrays, export_scene  # noqa: E402
 from addon.pipeline import machine  # noqa: E402
 from tests import cycles  # noqa: E402
 from tests.exactness import qualities  # noqa: E402
-from tests.fast_judge import Verdicts, judge_rays  # noqa: E402
+from tests.fast_judge import Verdicts, address, judge_rays  # noqa: E402
 from tests.hard_cases import Case, make  # noqa: E402
 from tests.judge import Floats, Ints, hit_one, rational  # noqa: E402
 from tools import page  # noqa: E402
 
 OUT = ROOT / "build/report"
 BENCH = ROOT / "build/bench/bench.json"
+PLAIN = ROOT / "build/release/libespalier_plain.so"
 SCENES = ("interior", "sculpture", "forest", "hall")
 SPEED_SCENE = PICTURE_SCENE = "interior"
 TURNS = 5  # of each tracer, one after the other
@@ -68,13 +71,21 @@ def ours(vertices: Floats, triangles: Ints) -> Tracer:
 
 
 def plain(vertices: Floats, triangles: Ints) -> Tracer:
-    """Our path without its safeguards, where this build of the module has it."""
-    tree: Any = espalier_native.build(vertices, triangles)
+    """Our path without its safeguards, which the shipped module does not have: tests/plain.cpp."""
+    library = ctypes.CDLL(str(PLAIN))
+    library.espalier_plain_build.restype = ctypes.c_void_p
+    corners, faces = np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(triangles, np.int32)
+    counts = ctypes.c_size_t(len(corners)), ctypes.c_size_t(len(faces))
+    tree = ctypes.c_void_p(library.espalier_plain_build(address(corners), counts[0], address(faces), counts[1]))
 
     def trace(origins: Floats, directions: Floats) -> Hits:
-        hits = tree.intersect_plain(origins, directions, threads=1)
-        return hits["triangle"], hits["t"]
+        o, d = (np.ascontiguousarray(rays, np.float32) for rays in (origins, directions))
+        triangle, t = np.empty(len(o), np.int32), np.empty(len(o), np.float32)
+        count = ctypes.c_size_t(len(o))
+        library.espalier_plain_intersect(tree, address(o), address(d), count, address(triangle), address(t))
+        return triangle, t
 
+    weakref.finalize(trace, library.espalier_plain_free, tree)
     return trace
 
 
@@ -113,7 +124,7 @@ def blender(vertices: Floats, triangles: Ints) -> Tracer:
 
 TRACERS: dict[str, Prepare] = {
     "Espalier": ours,
-    **({"Espalier without its safeguards": plain} if hasattr(espalier_native.Tree, "intersect_plain") else {}),
+    "Espalier without safeguards": plain,
     "Embree, robust": embree(True),
     "Embree, not robust": embree(False),
     "Blender's BVHTree": blender,
