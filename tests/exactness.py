@@ -131,7 +131,24 @@ def ask(case: str, rays: int, seed: int = 0) -> Question:
     t_min = np.concatenate([t_min, zero, zero, at, np.minimum(after, np.finfo(np.float32).max)])
     t_max = np.concatenate([t_max, at, before, infinite, infinite])
     rays_of = vertices, triangles, origins[pick], directions[pick], t_min, t_max
-    return Question(*rays_of, judge_rays(*rays_of))
+    return Question(*rays_of, cut_short(whole, pick, *rays_of))
+
+
+def cut_short(whole: Verdicts, pick: NDArray[np.intp], *rays_of: Any) -> Verdicts:
+    """Verdicts on rays with ends, where `whole` has those on the same without any, of which these are `pick`."""
+    vertices, triangles, origins, directions, t_min, t_max = rays_of
+    triangle, t, u, v = (array[pick].copy() for array in (whole.triangle, whole.t, whole.u, whole.v))
+    # The nearest hit of all stays the nearest, or lies beyond the end. Near the ends that has to be asked again.
+    beyond = t > t_max
+    triangle[beyond] = -1
+    t[beyond] = u[beyond] = v[beyond] = 0
+    with np.errstate(invalid="ignore"):
+        is_near = ~(np.abs(whole.t[pick] - t_max) > 2.0**-40 * t_max) & ~np.isinf(t_max)
+    again = np.flatnonzero((whole.triangle[pick] >= 0) & ((t_min > 0) | is_near))
+    asked = judge_rays(vertices, triangles, *(array[again] for array in (origins, directions, t_min, t_max)))
+    for all_of, some in ((triangle, asked.triangle), (t, asked.t), (u, asked.u), (v, asked.v)):
+        all_of[again] = some
+    return Verdicts(triangle, t, u, v)
 
 
 def selection(question: Question, way: Way) -> NDArray[np.intp]:

@@ -52,6 +52,7 @@ def packets_of(origins: Floats, directions: Floats) -> tuple[Floats, Floats]:
     """For every sixteenth ray its origin, or a point some way behind, and, of all that rays aim at, the sixteen points
     that it sees closest to the ray; both [N,16,3]."""
     every = np.unique(origins + directions, axis=0)
+    every = every[:: -(-len(every) // 4096)]  # each ray looks at all of them
     every = np.resize(every, (max(len(every), PACKET), 3))
     points, aims = [], []
     for number, (origin, direction) in enumerate(zip(origins[::PACKET], directions[::PACKET], strict=True)):

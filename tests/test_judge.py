@@ -10,6 +10,7 @@ import pytest
 from gmpy2 import mpq
 from numpy.typing import ArrayLike
 
+from tests.exactness import ask
 from tests.fast_judge import Errors, Verdicts, errors, judge_rays
 from tests.hard_cases import CASES, make
 from tests.judge import MISS, Floats, Ints, Verdict, judge, ulps
@@ -86,6 +87,16 @@ def test_faces_that_cannot_be_hit() -> None:
     assert judge_rays(points, triangles, origins, directions).triangle.tolist() == [-1, -1]
     nothing = np.zeros((0, 3), np.int32)
     assert judge_rays(points, nothing, origins, directions).triangle.tolist() == [-1, -1]
+
+
+@pytest.mark.parametrize("case", ["at_edges", "any_length", "ulps_apart", "stacked_copies", "from_the_surface"])
+def test_rays_with_ends_are_judged_as_if_they_were_new(case: str) -> None:
+    question = ask(case, 2_000)
+    rays = (question.origins, question.directions, question.t_min, question.t_max)
+    anew = judge_rays(question.vertices, question.triangles, *rays)
+    assert 0.1 < np.mean(anew.triangle >= 0) < 0.9, "some end before what they would hit"
+    for key in ("triangle", "t", "u", "v"):
+        np.testing.assert_array_equal(getattr(question.verdicts, key), getattr(anew, key), key)
 
 
 def test_ulps() -> None:

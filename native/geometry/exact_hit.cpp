@@ -40,6 +40,36 @@ Side measure_side_exactly(Vec3f origin, Vec3f direction, Vec3f p, Vec3f q) {
     return {value, std::abs(value) * 0x1p-51};
 }
 
+/// The corners' weights, each the edge function of the edge opposite.
+struct Weights {
+    Side side[3];
+    double det = 0;
+    double error = 0;  ///< of det
+
+    void add_up() {
+        det = side[0].value + side[1].value + side[2].value;
+        error = side[0].error + side[1].error + side[2].error;
+    }
+    bool are_open() const {
+        const auto is_open = [](const Side& s) { return std::abs(s.value) <= s.error; };
+        return is_open(side[0]) || is_open(side[1]) || is_open(side[2]) || std::abs(det) < 4 * error;
+    }
+    void place(ExactHit& hit) const {
+        hit.u = side[1].value / det;
+        hit.v = side[2].value / det;
+        hit.place_error = 2 * error / std::abs(det);
+    }
+};
+
+Weights weigh_exactly(Vec3f origin, Vec3f direction, const Vec3f (&corner)[3]) {
+    Weights weights;
+    for (int k = 0; k < 3; ++k) {
+        weights.side[k] = measure_side_exactly(origin, direction, corner[(k + 1) % 3], corner[(k + 2) % 3]);
+    }
+    weights.add_up();
+    return weights;
+}
+
 int largest_component(Vec3f d) {
     const Vec3f a{std::abs(d.x), std::abs(d.y), std::abs(d.z)};
     return a.x > a.y ? (a.x > a.z ? 0 : 2) : (a.y > a.z ? 1 : 2);
@@ -63,33 +93,22 @@ bool hit_exactly(Vec3f origin, Vec3f direction, const Vec3f (&corner)[3], ExactH
     for (int k = 0; k < 3; ++k) {
         p[k] = to_double(corner[k]) - to_double(origin);
     }
-    // side[k] belongs to the edge opposite corner k, and is that corner's weight.
-    Side side[3];
+    Weights weights;
+    const auto& side = weights.side;
     for (int k = 0; k < 3; ++k) {
         const Vec3d edge = to_double(corner[(k + 2) % 3]) - to_double(corner[(k + 1) % 3]);
-        side[k] = measure_side(d, p[(k + 1) % 3], edge);
+        weights.side[k] = measure_side(d, p[(k + 1) % 3], edge);
     }
-    const auto add_up = [&](double& det, double& error) {
-        det = side[0].value + side[1].value + side[2].value;
-        error = side[0].error + side[1].error + side[2].error;
-    };
-    double det;
-    double error;
-    add_up(det, error);
-    const auto is_open = [](const Side& s) { return std::abs(s.value) <= s.error; };
-    if (is_open(side[0]) || is_open(side[1]) || is_open(side[2]) || std::abs(det) < error * 0x1p28) {
-        for (int k = 0; k < 3; ++k) {
-            side[k] = measure_side_exactly(origin, direction, corner[(k + 1) % 3], corner[(k + 2) % 3]);
-        }
-        add_up(det, error);
+    weights.add_up();
+    if (weights.are_open()) {
+        weights = weigh_exactly(origin, direction, corner);
     }
     const bool any_positive = side[0].value > 0 || side[1].value > 0 || side[2].value > 0;
     const bool any_negative = side[0].value < 0 || side[1].value < 0 || side[2].value < 0;
     if (any_positive == any_negative) {  // on both sides, or in the plane
         return false;
     }
-    hit.u = side[1].value / det;
-    hit.v = side[2].value / det;
+    weights.place(hit);
     for (int k = 0; k < 3; ++k) {
         hit.corner[k] = corner[k];
     }
@@ -99,14 +118,17 @@ bool hit_exactly(Vec3f origin, Vec3f direction, const Vec3f (&corner)[3], ExactH
     const double z[3] = {p[0][axis], p[1][axis], p[2][axis]};
     const double spread = std::max({z[0], z[1], z[2]}) - std::min({z[0], z[1], z[2]});
     const double size = std::max({std::abs(z[0]), std::abs(z[1]), std::abs(z[2])});
-    const double mean = (side[0].value * z[0] + side[1].value * z[1] + side[2].value * z[2]) / det;
+    const double mean = (side[0].value * z[0] + side[1].value * z[1] + side[2].value * z[2]) / weights.det;
     const double reach = std::abs(d[axis]);
     hit.t = mean / d[axis];
-    hit.error = (error * spread / (std::abs(det) - error) + 0x1p-49 * size) / reach;
+    hit.error = (weights.error * spread / (std::abs(weights.det) - weights.error) + 0x1p-49 * size) / reach;
     return true;
 }
 
-void finish_distance(Vec3f origin, Vec3f direction, ExactHit& hit) {
+void finish_hit(Vec3f origin, Vec3f direction, ExactHit& hit) {
+    if (!(hit.place_error <= 0x1p-23)) {
+        weigh_exactly(origin, direction, hit.corner).place(hit);
+    }
     if (!(hit.error <= std::abs(hit.t) * 0x1p-28)) {
         const Quotient distance = exact_distance(origin, direction, hit.corner);
         hit.t = distance.above.estimate() / distance.below.estimate();

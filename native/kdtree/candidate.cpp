@@ -60,7 +60,7 @@ Hit finish_exactly(const Ray& ray, const TriangleBlock* blocks, uint32_t place) 
     if (!hit_place(ray, blocks, place, hit)) {
         return missed(ray);
     }
-    finish_distance(ray.origin, ray.direction, hit);
+    finish_hit(ray.origin, ray.direction, hit);
     return {round_to_float(hit.t), static_cast<float>(hit.u), static_cast<float>(hit.v), hit.triangle};
 }
 

@@ -36,7 +36,7 @@ struct alignas(64) FinishBatch {
 /// instruction set takes the same way.
 ///
 /// As in exact_hit.cpp: an edge function is off by less than 2^-49 times the sum of its terms' sizes. Where each
-/// outweighs its error and their sum 2^28 times its own, u and v are off by less than 2^-27. The error of t adds what
+/// outweighs its error and their sum 2^24 times its own, u and v are off by less than 2^-22.9. The error of t adds what
 /// those of the weights move it among the corners, and 16 roundings of the largest coordinate along the ray.
 HWY_INLINE uint32_t finish_in_double(FinishBatch& batch) {
     const hn::CappedTag<double, FinishBatch::kSize> d;
@@ -97,7 +97,7 @@ HWY_INLINE uint32_t finish_in_double(FinishBatch& batch) {
         const V allowed = hn::Mul(hn::Abs(hn::Mul(t, along)), hn::Set(d, 0x1p-28));
         const auto sides_sure = hn::And(
             hn::And(hn::Gt(hn::Abs(side[0]), side_error[0]), hn::Gt(hn::Abs(side[1]), side_error[1])),
-            hn::And(hn::Gt(hn::Abs(side[2]), side_error[2]), hn::Ge(hn::Abs(det), hn::Mul(error, hn::Set(d, 0x1p28)))));
+            hn::And(hn::Gt(hn::Abs(side[2]), side_error[2]), hn::Ge(hn::Abs(det), hn::Mul(error, hn::Set(d, 0x1p24)))));
         const auto sure =
             hn::And(sides_sure, hn::And(hn::Le(depth_error, allowed),
                                         hn::Le(hn::Abs(t), hn::Set(d, double{std::numeric_limits<float>::max()}))));

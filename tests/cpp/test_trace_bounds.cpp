@@ -326,7 +326,7 @@ TEST_P(TraceBounds, OfTheFloatFilterHoldWhatItDoesNotDecide) {
 TEST_P(TraceBounds, OfTheFinishAreKept) {
     Random random(6);
     Share distance(named("t in ulps, 12"));
-    Share place(named("u and v over 2^-24.5, 12"));
+    Share place(named("u and v over 2^-22.6, 12"));
     uint32_t finished = 0;
     for (const auto& [low, high] : kRanges) {
         for (int i = 0; i < 5000; ++i) {
@@ -340,8 +340,8 @@ TEST_P(TraceBounds, OfTheFinishAreKept) {
             const Exact t = truth.t();
             const int exponent = t == 0 ? -126 : std::max(std::ilogb(size_of(t).get_d()), -126);
             distance.add(Exact(result.t) - t, Exact(std::ldexp(1.0, exponent - 23)));
-            place.add(Exact(result.u) - truth.weight[1] / truth.below, Exact(std::exp2(-24.5)));
-            place.add(Exact(result.v) - truth.weight[2] / truth.below, Exact(std::exp2(-24.5)));
+            place.add(Exact(result.u) - truth.weight[1] / truth.below, Exact(std::exp2(-22.6)));
+            place.add(Exact(result.v) - truth.weight[2] / truth.below, Exact(std::exp2(-22.6)));
         }
     }
     EXPECT_GT(finished, 3000U);
@@ -357,7 +357,7 @@ TEST(DoubleBounds, OfSidesAndDistances) {
     Random random(7);
     Share side_share("sides in double, 9");
     Share distance_share("distance in double, 9");
-    Share place_share("u and v over 2^-26, 9");
+    Share place_share("u and v over 2^-22.9, 9");
     Share estimate_share("estimate of an expansion, 10");
     uint32_t different = 0;
     uint32_t open = 0;
@@ -386,8 +386,9 @@ TEST(DoubleBounds, OfSidesAndDistances) {
                 continue;
             }
             distance_share.add(hit.t - truth.t(), hit.error);
-            place_share.add(hit.u - truth.weight[1] / truth.below, Exact(0x1p-26));
-            place_share.add(hit.v - truth.weight[2] / truth.below, Exact(0x1p-26));
+            finish_hit(ray.origin, ray.direction, hit);
+            place_share.add(hit.u - truth.weight[1] / truth.below, Exact(std::exp2(-22.9)));
+            place_share.add(hit.v - truth.weight[2] / truth.below, Exact(std::exp2(-22.9)));
         }
     }
     EXPECT_EQ(different, 0U);
@@ -450,7 +451,7 @@ TEST(DoubleBounds, LeaveNoComparisonOpen) {
                 limit = std::nextafter(limit, HUGE_VALF);
             }
             wrong += compare_distance(ray.origin, ray.direction, a, limit) != sgn(Exact(t - limit)) ? 1U : 0U;
-            finish_distance(ray.origin, ray.direction, a);
+            finish_hit(ray.origin, ray.direction, a);
             share.add(a.t - t, size_of(t) * Exact(0x1p-27) + Exact(0x1p-1000));
         }
     }
