@@ -137,7 +137,7 @@ def ask(case: str, rays: int, seed: int = 0) -> Question:
 def cut_short(whole: Verdicts, pick: NDArray[np.intp], *rays_of: Any) -> Verdicts:
     """Verdicts on rays with ends, where `whole` has those on the same without any, of which these are `pick`."""
     vertices, triangles, origins, directions, t_min, t_max = rays_of
-    triangle, t, u, v = (array[pick].copy() for array in (whole.triangle, whole.t, whole.u, whole.v))
+    triangle, t, u, v = whole.triangle[pick], whole.t[pick], whole.u[pick], whole.v[pick]
     # The nearest hit of all stays the nearest, or lies beyond the end. Near the ends that has to be asked again.
     beyond = t > t_max
     triangle[beyond] = -1
@@ -146,8 +146,7 @@ def cut_short(whole: Verdicts, pick: NDArray[np.intp], *rays_of: Any) -> Verdict
         is_near = ~(np.abs(whole.t[pick] - t_max) > 2.0**-40 * t_max) & ~np.isinf(t_max)
     again = np.flatnonzero((whole.triangle[pick] >= 0) & ((t_min > 0) | is_near))
     asked = judge_rays(vertices, triangles, *(array[again] for array in (origins, directions, t_min, t_max)))
-    for all_of, some in ((triangle, asked.triangle), (t, asked.t), (u, asked.u), (v, asked.v)):
-        all_of[again] = some
+    triangle[again], t[again], u[again], v[again] = asked.triangle, asked.t, asked.u, asked.v
     return Verdicts(triangle, t, u, v)
 
 
