@@ -21,12 +21,12 @@ Case = tuple[Floats, Ints, Floats, Floats]
 MakeCase = Callable[[Generator, int], Case]
 
 
-PACKET = 16
+PACKET = 32  # as many as any instruction set takes as one packet
 
 
 def make(name: str, rays: int, seed: int = 0) -> Case:
     """About so many rays of a case: a third as the case makes them, a third from one point, and a third to one point,
-    sixteen at a time, as cameras and lamps have them. Nearly all end at what was aimed at, at t = 1."""
+    a packet at a time, as cameras and lamps have them. Nearly all end at what was aimed at, at t = 1."""
     rng = np.random.default_rng([zlib.crc32(name.encode()), seed])
     vertices, triangles, origins, directions = CASES[name](rng, max(rays // 3, PACKET))
     # Rays that the module refuses give way to others, and whole packets are left.
@@ -49,8 +49,8 @@ def is_taken(origins: Floats, directions: Floats) -> NDArray[np.bool_]:
 
 
 def packets_of(origins: Floats, directions: Floats) -> tuple[Floats, Floats]:
-    """For every sixteenth ray its origin, or a point some way behind, and, of all that rays aim at, the sixteen points
-    that it sees closest to the ray; both [N,16,3]."""
+    """For one ray per packet its origin, or a point some way behind, and, of all that rays aim at, the points that it
+    sees closest to the ray; both [N,PACKET,3]."""
     every = np.unique(origins + directions, axis=0)
     every = every[:: -(-len(every) // 4096)]  # each ray looks at all of them
     every = np.resize(every, (max(len(every), PACKET), 3))

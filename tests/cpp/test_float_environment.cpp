@@ -1,11 +1,15 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <cmath>
 #include <cstring>
+#include <set>
 
 #include "geometry/float_environment.h"
+#include "kdtree/parallel.h"
 #include "rays.h"
+#include "render/render.h"
 
 namespace espalier {
 namespace {
@@ -97,6 +101,44 @@ TEST(FloatEnvironment, OfTheHostChangesNothing) {
             EXPECT_EQ(answers.blocked, expected.blocked);
         }
     }
+}
+
+TEST(FloatEnvironment, OfTheHostIsNotThatOfThePool) {
+    const HostSettings host;
+    int felt[3] = {};
+    run_on_threads(
+        3, [](void* context, int worker) { static_cast<int*>(context)[worker] = HostSettings::are_felt() ? 1 : 2; },
+        felt);
+    EXPECT_EQ(felt[0], 1);
+    EXPECT_EQ(felt[1], 2);
+    EXPECT_EQ(felt[2], 2);
+}
+
+TEST(FloatEnvironment, OfTheHostMovesNoVertexAndNoLight) {
+    const Mesh sphere = make_sphere(12, 16);
+    const MeshInput mesh{"m", sphere.positions, sphere.triangles, NormalKind::kFlat, {}, {}};
+    const Matrix4 matrix{{{{0.9, -0.6, 0.1, 1.0 / 3}, {0.6, 0.7, 0.1, 0.1}, {0.1, 0.2, 1.1, 0.7}, {0, 0, 0, 1}}}};
+    const std::vector<Placement> placements{{"o", 0, matrix, {0}}};
+    const std::vector<float> color{0.9F, 0.7F, 0.3F};
+    const auto place = [&] { return Scene(std::span(&mesh, 1), placements, color, 1); };
+    const Scene scene = place();
+    const Tree tree = build(scene.soup(), {});
+    const Camera camera(Projection::kOrthographic, Matrix4{{{{1, 0, 0, 0}, {0, 1, 0, 0}, {0, 0, 1, 9}, {0, 0, 0, 1}}}},
+                        Matrix4{{{{0.7, 0, 0, 0}, {0, 0.7, 0, 0}, {0, 0, -0.1, 0}, {0, 0, 0, 1}}}}, scene.centre());
+    const auto draw = [&] {
+        Film film(16, 16);
+        std::vector<float> pixels(size_t{4} * 16 * 16);
+        render_picture(scene, tree, camera, {}, {.threads = 1}, film, false);
+        film.copy_finished(pixels);
+        return pixels;
+    };
+    const std::vector<float> expected = draw();
+    ASSERT_GT(std::set<float>(expected.begin(), expected.end()).size(), 100U);
+
+    const HostSettings host;
+    const Scene again = place();
+    EXPECT_TRUE(std::ranges::equal(again.soup().positions, scene.soup().positions));
+    EXPECT_EQ(draw(), expected);
 }
 
 #if defined(__x86_64__)

@@ -27,6 +27,10 @@ TEST(ClassifyFace, DecidesAreaExactly) {
     const float third = 1.0F / 3.0F;
     EXPECT_EQ(classify_face({third, third, third}, {2 * third, 2 * third, 2 * third}, {1e10F, 1e10F, 1e10F}),
               FaceFault::kNoArea);
+    // The same along a slope, so that the differences' errors do not cancel.
+    const float step = 0x155555p-24F;
+    EXPECT_EQ(classify_face({step, 7 * step, 0}, {4 * step, 28 * step, 0}, {0x1p34F * step, 0x7p34F * step, 0}),
+              FaceFault::kNoArea);
     // One ulp beside it, far from the origin.
     const float x = 16777216.0F;
     EXPECT_EQ(classify_face({x, x, 0}, {x + 2, x + 2, 0}, {2 * x, 2 * x, 0}), FaceFault::kNoArea);
