@@ -38,6 +38,19 @@ TEST(Expansion, CompressesWhenItRunsOutOfRoom) {
         sum = sum - Expansion(number);
     }
     EXPECT_EQ(sum.sign(), 0) << "what was added has been taken away to the last bit";
+
+    // Every third bit, each in a part of its own: pushed out of a part by a larger number that is taken away again.
+    const auto bit = [](int i) { return std::ldexp(1.0, 3 * i - 600); };
+    for (int i = 0; i < 300; ++i) {
+        const double above = bit(i) * 0x1p52;
+        const double far = bit(i) * 0x1p60;
+        sum = sum + Expansion(bit(i) + above) + Expansion(far) - Expansion(far + above);
+    }
+    for (int i = 0; i < 300; ++i) {
+        EXPECT_EQ(sum.sign(), 1);
+        sum = sum - Expansion(bit(i));
+    }
+    EXPECT_EQ(sum.sign(), 0);
 }
 
 TEST(Expansion, MultipliesOut) {
