@@ -289,6 +289,42 @@ TEST(Traversal, RaysMayEndTogetherAnywhere) {
     }
 }
 
+/// Seen from where they meet, what lies behind is at depths below zero, which the box test has no room for.
+TEST(Traversal, RaysMayPassTheirCommonEnd) {
+    Mesh mesh;
+    mesh.add_triangle({-9, -9, -1}, {9, -9, -1}, {0, 9, -1});
+    const Tree tree = build(mesh.soup(), {});
+    for (const float t_max : {1.0F, 1.5F, INFINITY}) {
+        std::vector<Ray> rays;
+        for (int i = 0; i < 32; ++i) {
+            const Vec3f from{0.01F * static_cast<float>(i), 0.02F, 2};
+            rays.push_back({from, 0, -from, t_max});
+        }
+        std::vector<uint8_t> blocked(rays.size());
+        occluded(tree, rays, blocked);
+        EXPECT_EQ(std::count(blocked.begin(), blocked.end(), 1), t_max > 1 ? 32 : 0);
+    }
+}
+
+/// The first and the last of them start in one point, and some between do not.
+TEST(Traversal, RaysOfOnePacketMayStartApart) {
+    Mesh mesh;
+    mesh.add_triangle({-1, -1, 0}, {1, -1, 0}, {0, 1, 0});
+    const Tree tree = build(mesh.soup(), {});
+    std::vector<Ray> rays(32, {{0, 0, 3}, 0, {0, 0, -1}, INFINITY});
+    for (size_t i = 3; i < rays.size(); i += 8) {
+        rays[i].origin.y = 9;
+    }
+    std::vector<Hit> hits(rays.size());
+    std::vector<uint8_t> blocked(rays.size());
+    intersect(tree, rays, hits);
+    occluded(tree, rays, blocked);
+    for (size_t i = 0; i < rays.size(); ++i) {
+        EXPECT_EQ(hits[i].triangle, i % 8 == 3 ? -1 : 0);
+        EXPECT_EQ(blocked[i], i % 8 == 3 ? 0 : 1);
+    }
+}
+
 TEST(Traversal, ClosedMeshIsWatertight) {
     const Mesh mesh = make_sphere(48, 64);
     const Tree tree = build(mesh.soup(), {});
