@@ -306,6 +306,36 @@ TEST(Traversal, RaysMayPassTheirCommonEnd) {
     }
 }
 
+/// Packets that meet a wall just where their rays end, or begin: the depth of its box is rounded, and may lie beyond.
+TEST(Traversal, PacketsReachTheEndsOfTheirRays) {
+    Mesh mesh;
+    mesh.add_triangle({0.7F, -9, -9}, {0.7F, 9, -9}, {0.7F, 0, 9});
+    const Tree tree = build(mesh.soup(), {});
+    std::mt19937 random(4);
+    const auto uniform = [&] { return static_cast<float>(random() >> 8) * 0x1p-24F; };
+    for (int i = 0; i < 2000; ++i) {
+        const Vec3f way = Vec3f{0.7F, uniform(), 1 + uniform()} * (1 + uniform());
+        Ray from_eye{{}, 0, way, INFINITY};
+        Ray to_lamp{way, 0, -way, 1};
+        Hit hit{};
+        intersect(tree, {&from_eye, 1}, {&hit, 1});
+        from_eye.t_max = std::nextafter(hit.t, INFINITY);
+        intersect(tree, {&to_lamp, 1}, {&hit, 1});
+        to_lamp.t_min = std::nextafter(hit.t, -INFINITY);
+        std::vector<Ray> packets(64, from_eye);
+        std::fill(packets.begin() + 32, packets.end(), to_lamp);
+        packets[32] = {way * 2.0F, 1, way * -2.0F, 1};  // so that lamp rays have nothing but their end in common
+        std::vector<Hit> hits(packets.size());
+        std::vector<uint8_t> blocked(packets.size());
+        intersect(tree, packets, hits);
+        occluded(tree, packets, blocked);
+        for (size_t n = 0; n < packets.size(); ++n) {
+            ASSERT_EQ(hits[n].triangle, n == 32 ? -1 : 0);
+            ASSERT_EQ(blocked[n], n == 32 ? 0 : 1);
+        }
+    }
+}
+
 /// The first and the last of them start in one point, and some between do not.
 TEST(Traversal, RaysOfOnePacketMayStartApart) {
     Mesh mesh;
