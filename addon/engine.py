@@ -40,8 +40,9 @@ class ESPALIER_engine(bpy.types.RenderEngine):
 
     def _draw_frame(self, depsgraph: bpy.types.Depsgraph) -> None:
         self.update_stats("", "Exporting")
-        # Blender made room for the scene's own resolution; the other one is the preview's alone.
-        run = Run(depsgraph, replace(options_of(depsgraph.scene), percentage=None))
+        # Blender made room for the scene's own resolution; the other one is the preview's alone. Nobody is shown what
+        # the build cost, so none of it is built for that.
+        run = Run(depsgraph, replace(options_of(depsgraph.scene), percentage=None, on_demand=True))
         x0, y0, x1, y1 = shown_part(depsgraph.scene.render, *run.size)
         target = self.begin_result(0, 0, x1 - x0, y1 - y0, layer=depsgraph.view_layer.name)
         try:

@@ -39,6 +39,7 @@ class Options:
     threads: int = 0  # 0: all
     samples: int = 4  # per pixel
     percentage: int | None = None  # of the scene's resolution; None: the scene's own percentage
+    on_demand: bool = False  # build subtrees of a large scene when rays enter them; no figures of the whole tree then
 
 
 @dataclass(frozen=True)
@@ -172,6 +173,7 @@ class Run:
             quality=options.quality,
             threads=options.threads,
             samples=options.samples,
+            on_demand=options.on_demand,
         )
 
     def _start_compare(self, scene: espalier_native.Scene, counts: list[int], options: Options) -> None:

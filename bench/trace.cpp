@@ -6,6 +6,7 @@
 
 #include "compare.h"
 #include "embree_rays.h"
+#include "kdtree/on_demand.h"
 
 namespace espalier::bench {
 namespace {
@@ -248,11 +249,13 @@ void draw_tile(const Mesh& mesh, const Pinhole& camera, float offset, int x0, in
 template <class NewBatch>
 void draw(const Mesh& mesh, float offset, int threads, const NewBatch& new_batch, std::vector<float>& picture) {
     constexpr int kAcross = kPicture / kTile;
+    constexpr size_t kFar = 16;
     const Pinhole camera(mesh.view);
     parallel_for(threads, size_t{kAcross} * kAcross, [&](size_t i) {
         auto eye = new_batch();
         auto light = new_batch();
-        const int tile = static_cast<int>(i);
+        // Tiles far apart, so that threads that open subtrees do not wait for one another.
+        const auto tile = static_cast<int>(i % kFar * (size_t{kAcross} * kAcross / kFar) + i / kFar);
         draw_tile(mesh, camera, offset, tile % kAcross * kTile, tile / kAcross * kTile, eye, light, picture);
     });
 }
@@ -284,14 +287,19 @@ Json compare_previews(const Mesh& mesh, int threads, double seconds) {
     std::vector<float> theirs = ours;
 
     std::vector<Contestant> contestants;
-    for (const Mode& mode : kModes) {
-        contestants.emplace_back(mode.name, threads, [&] {
-            malloc_trim(0);
-            const Stopwatch watch;
-            const Tree tree = build(mesh.soup(), {.quality = mode.quality, .threads = threads});
-            draw(mesh, offset, threads, [&] { return OurBatch(tree); }, ours);
-            return watch.ms();
-        });
+    for (const bool on_demand : {false, true}) {
+        for (const Mode& mode : kModes) {
+            contestants.emplace_back(
+                on_demand ? mode.name + std::string(", on demand") : mode.name, threads, [&, on_demand] {
+                    malloc_trim(0);
+                    const Stopwatch watch;
+                    const Tree tree = build(mesh.soup(), {.quality = mode.quality,
+                                                          .threads = threads,
+                                                          .on_demand_from = on_demand ? kOnDemandPays : UINT32_MAX});
+                    draw(mesh, offset, threads, [&] { return OurBatch(tree); }, ours);
+                    return watch.ms();
+                });
+        }
     }
     contestants.emplace_back(kMedium.name, threads, [&] {
         malloc_trim(0);

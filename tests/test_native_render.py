@@ -109,6 +109,23 @@ def test_clip_range_holds(projection: str) -> None:
         assert np.all(covered(image) == seen), depth
 
 
+def test_picture_of_a_tree_opened_on_demand_is_the_same() -> None:
+    ball = mesh(*sphere(60, 90))
+    row = scene([ball], [placed(moved(3.0 * i, 0, 0)) for i in range(50)])
+    assert row.triangle_count > 500_000
+    view = camera(looking((0, -6, 1), (0, 0, 0)), VIEWS["perspective"])
+    drawn = {
+        on_demand: espalier_native.render(row, view, [], BACKGROUND, 48, 36, samples=2, on_demand=on_demand)
+        for on_demand in (False, True)
+    }
+    assert 0 < np.count_nonzero(covered(drawn[False]["image"])) < 48 * 36
+    np.testing.assert_array_equal(drawn[True]["image"], drawn[False]["image"])
+    whole, part = drawn[False]["build"], drawn[True]["build"]
+    assert (whole["subtrees"], whole["opened"]) == (0, 0)
+    assert 0 < part["opened"] < part["subtrees"] / 2
+    assert part["nodes"] == 0 < whole["nodes"]
+
+
 def test_samples_cover_their_pixel_evenly() -> None:
     samples = 64
     half = mesh(np.array([[-9, -9, 0], [0.25, -9, 0], [0.25, 9, 0], [-9, 9, 0]]), QUAD)

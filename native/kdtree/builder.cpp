@@ -7,6 +7,7 @@
 #include "geometry/float_environment.h"
 #include "kdtree/build_kernels.h"
 #include "kdtree/layout.h"
+#include "kdtree/on_demand.h"
 #include "kdtree/parallel.h"
 #include "kdtree/quality.h"
 #include "kdtree/subtrees.h"
@@ -89,6 +90,19 @@ class Builder {
         return std::move(tree_);
     }
 
+    /// The top of the tree alone.
+    Tree build_on_demand() {
+        Stopwatch total;
+        Stopwatch watch;
+        tree_.on_demand = std::make_shared<OnDemand>(soup_, parameters_, cancel_, threads_);
+        tree_.on_demand->make_references(tree_);
+        tree_.report.phases_ms.bounds = watch.lap();
+        tree_.on_demand->split_top(tree_);
+        tree_.report.phases_ms.top_levels = watch.lap();
+        tree_.report.build_ms = total.lap();
+        return std::move(tree_);
+    }
+
     int threads() const { return threads_; }
 
  private:
@@ -116,10 +130,13 @@ Tree build(const TriangleSoup& soup, const BuildOptions& options) {
     }
     const FloatEnvironment environment;
     Builder builder(soup, options);
-    Tree tree = builder.build();
+    const bool on_demand = soup.size() >= options.on_demand_from;
+    Tree tree = on_demand ? builder.build_on_demand() : builder.build();
     tree.report.threads = builder.threads();
     tree.report.triangles = soup.size();
-    measure_quality(tree, builder.threads());
+    if (!on_demand) {
+        measure_quality(tree, builder.threads());
+    }
     return tree;
 }
 

@@ -3,29 +3,14 @@
 
 #include <algorithm>
 #include <array>
-#include <bit>
 #include <vector>
 
 #include "kdtree/build_kernels.h"
 #include "kdtree/parallel.h"
+#include "kdtree/wide_nodes.h"
 
 namespace espalier {
 namespace {
-
-/// Wide nodes in the order in which they are made. Reserved for the worst case, taken page by page.
-class WideNodes {
- public:
-    WideNodes() = default;
-    WideNodes(size_t capacity, size_t expected) : nodes_(capacity, expected * sizeof(WideNode)) {}
-    uint32_t add() { return count_++; }
-    uint32_t count() const { return count_; }
-    WideNode* data() { return nodes_.data(); }
-    void clear() { count_ = 0; }
-
- private:
-    LargeBuffer<WideNode> nodes_;
-    uint32_t count_ = 0;
-};
 
 /// A run of kd nodes that forms one subtree, laid out by one thread. Where the tree is cut into such runs depends on
 /// the tree alone, so that the layout is the same for any number of threads.
@@ -51,7 +36,7 @@ struct Item {
 
 class Collapse {
  public:
-    Collapse(const Tree& tree, std::span<const Box3f> boxes) : tree_(tree), boxes_(boxes) {}
+    Collapse(std::span<const KdNode> nodes, std::span<const Box3f> boxes) : nodes_(nodes), boxes_(boxes) {}
 
     /// Appends the wide node for a kd node and all below it; returns its index. A kd node listed in `runs` is not
     /// entered: its child code is the index of its run, marked for the caller to resolve.
@@ -61,10 +46,9 @@ class Collapse {
 
  private:
     Item item(uint32_t node) const {
-        const KdNode kd = tree_.nodes[node];
+        const KdNode kd = nodes_[node];
         const Box3f& box = boxes_[node];
-        const Vec3f size = box.size();
-        Item made{node, 0, 0, size.x * size.y + size.y * size.z + size.z * size.x, box};
+        Item made{node, 0, 0, half_area(box), box};
         if (kd.is_leaf()) {
             made.first_block = kd.first_block();
             made.blocks = block_count(kd.references());
@@ -72,9 +56,7 @@ class Collapse {
         return made;
     }
 
-    static bool is_empty(const Tree& tree, uint32_t node) {
-        return tree.nodes[node].is_leaf() && tree.nodes[node].references() == 0;
-    }
+    bool is_empty(uint32_t node) const { return nodes_[node].is_leaf() && nodes_[node].references() == 0; }
 
     static const Run* find_run(const std::vector<Run>* runs, uint32_t node) {
         if (runs == nullptr) {
@@ -87,8 +69,7 @@ class Collapse {
 
     uint32_t collapse(const Item& root, WideNodes& out, const std::vector<Run>* runs) const {
         std::array<Item, WideNode::kWidth> items;
-        // Per octant the slots of `items`, 4 bits each, the farthest lowest.
-        std::array<uint32_t, 8> order{};
+        ChildOrder order;
         int count = 1;
         items[0] = root;
         for (;;) {
@@ -101,30 +82,12 @@ class Collapse {
 
         const uint32_t index = out.add();
         WideNode& made = out.data()[index];
-        made = {};
-        std::fill_n(made.child, WideNode::kWidth, WideNode::leaf(0, 1));  // where no child is, no ray gets
-        for (int i = 0; i < WideNode::kWidth; ++i) {
-            const Box3f box = i < count ? items[static_cast<size_t>(i)].box : Box3f{};
-            for (int axis = 0; axis < 3; ++axis) {
-                made.lower[axis][i] = box.lower[axis];
-                made.upper[axis][i] = box.upper[axis];
-            }
-        }
-        for (size_t octant = 0; octant < 8; ++octant) {
-            // Unused slots come first, that is farthest: no ray meets them, but each slot has to appear once.
-            uint32_t word = 0;
-            int place = 0;
-            for (int slot = count; slot < WideNode::kWidth; ++slot) {
-                word |= static_cast<uint32_t>(slot) << (3 * place++);
-            }
-            for (int rank = 0; rank < count; ++rank) {
-                word |= (order[octant] >> (4 * rank) & 7U) << (3 * place++);
-            }
-            made.order[octant] = word;
-        }
+        std::array<Box3f, WideNode::kWidth> boxes;
+        std::transform(items.begin(), items.begin() + count, boxes.begin(), [](const Item& item) { return item.box; });
+        order.write(std::span(boxes).first(static_cast<size_t>(count)), made);
         for (int i = 0; i < count; ++i) {
             const Item& child = items[static_cast<size_t>(i)];
-            if (child.blocks == 0 && is_empty(tree_, child.node)) {
+            if (child.blocks == 0 && is_empty(child.node)) {
                 continue;  // both halves of a split may have lost all they had; no ray meets the box of nothing
             }
             if (child.blocks != 0 && child.blocks <= WideNode::kMaxLeafBlocks) {
@@ -147,7 +110,7 @@ class Collapse {
         int best = -1;
         for (int i = 0; i < count; ++i) {
             const Item& candidate = items[static_cast<size_t>(i)];
-            const bool is_inner = candidate.blocks == 0 && !is_empty(tree_, candidate.node) &&
+            const bool is_inner = candidate.blocks == 0 && !is_empty(candidate.node) &&
                                   (candidate.node == root || find_run(runs, candidate.node) == nullptr);
             const bool is_long_leaf = candidate.blocks > WideNode::kMaxLeafBlocks;
             if ((is_inner || is_long_leaf) && (best < 0 || candidate.area > items[static_cast<size_t>(best)].area)) {
@@ -158,7 +121,7 @@ class Collapse {
     }
 
     /// Replaces an item by its two parts, the near one first in each octant's order.
-    void open(std::array<Item, WideNode::kWidth>& items, int& count, int slot, std::array<uint32_t, 8>& order) const {
+    void open(std::array<Item, WideNode::kWidth>& items, int& count, int slot, ChildOrder& order) const {
         const Item opened = items[static_cast<size_t>(slot)];
         int axis = 0;
         if (opened.blocks != 0) {
@@ -170,33 +133,22 @@ class Collapse {
             items[static_cast<size_t>(slot)] = first;
             items[static_cast<size_t>(count)] = second;
         } else {
-            const KdNode kd = tree_.nodes[opened.node];
+            const KdNode kd = nodes_[opened.node];
             const uint32_t left = opened.node + 1;
             const uint32_t right = kd.right_child();
             axis = kd.axis();
-            if (is_empty(tree_, left) || is_empty(tree_, right)) {  // an empty leaf takes no place
-                items[static_cast<size_t>(slot)] = item(is_empty(tree_, left) ? right : left);
+            if (is_empty(left) || is_empty(right)) {  // an empty leaf takes no place
+                items[static_cast<size_t>(slot)] = item(is_empty(left) ? right : left);
                 return;
             }
             items[static_cast<size_t>(slot)] = item(left);
             items[static_cast<size_t>(count)] = item(right);
         }
-        for (unsigned octant = 0; octant < 8; ++octant) {
-            // The two take the place of the opened one, and everything nearer moves up by one.
-            const bool left_is_nearer = (octant >> axis & 1U) == 0;
-            const uint32_t near = left_is_nearer ? static_cast<uint32_t>(slot) : static_cast<uint32_t>(count);
-            const uint32_t far = left_is_nearer ? static_cast<uint32_t>(count) : static_cast<uint32_t>(slot);
-            // The lowest nibble that equals the slot.
-            const uint32_t differing = order[octant] ^ (static_cast<uint32_t>(slot) * 0x11111111U);
-            const int shift = std::countr_zero((differing - 0x11111111U) & ~differing & 0x88888888U) - 3;
-            const uint32_t farther = order[octant] & ((1U << shift) - 1);
-            const uint32_t nearer = static_cast<uint32_t>(uint64_t{order[octant]} >> (shift + 4) << (shift + 8));
-            order[octant] = nearer | (near << (shift + 4)) | (far << shift) | farther;
-        }
+        order.split(axis, slot, count);
         ++count;
     }
 
-    const Tree& tree_;
+    std::span<const KdNode> nodes_;
     std::span<const Box3f> boxes_;
 };
 
@@ -214,7 +166,19 @@ void find_runs(const Tree& tree, uint32_t begin, uint32_t end, uint32_t longest,
     find_runs(tree, node.right_child(), end, longest, runs);
 }
 
+/// How many wide nodes so many kd nodes and blocks may become.
+size_t most_nodes(size_t nodes, size_t blocks) { return nodes + blocks / (WideNode::kMaxLeafBlocks / 2) + 1; }
+
 }  // namespace
+
+void collapse_whole(std::span<const KdNode> nodes, std::span<const Box3f> boxes, size_t blocks, WideNodes& out) {
+    const size_t most = most_nodes(nodes.size(), blocks);
+    if (out.capacity() < most) {
+        out = WideNodes(2 * most, most / 8);
+    }
+    out.clear();
+    Collapse(nodes, boxes).collapse(0, out, nullptr);
+}
 
 void build_layout(const TriangleSoup& soup, std::span<const Box3f> boxes, std::span<const uint32_t> triangles,
                   int threads, Tree& tree) {
@@ -227,8 +191,8 @@ void build_layout(const TriangleSoup& soup, std::span<const Box3f> boxes, std::s
     std::vector<Run> runs;
     find_runs(tree, 0, nodes, run_length(nodes), runs);
 
-    const Collapse collapse(tree, boxes);
-    const size_t most_wide_nodes = size_t{nodes} + blocks / (WideNode::kMaxLeafBlocks / 2) + 1;
+    const Collapse collapse(tree.nodes.span(), boxes);
+    const size_t most_wide_nodes = most_nodes(nodes, blocks);
     std::vector<WideNodes> made(static_cast<size_t>(threads));
     const size_t block_tasks = (blocks + kBlocksPerTask - 1) / kBlocksPerTask;
     parallel_for(threads, runs.size() + block_tasks, [&](size_t i, int worker) {

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "kdtree/tree.h"
+#include "kdtree/wide_nodes.h"
 
 namespace espalier {
 
@@ -11,5 +12,8 @@ namespace espalier {
 /// room for them.
 void build_layout(const TriangleSoup& soup, std::span<const Box3f> boxes, std::span<const uint32_t> triangles,
                   int threads, Tree& tree);
+
+/// The wide nodes alone, of a subtree by itself: root first, with indices that count from there.
+void collapse_whole(std::span<const KdNode> nodes, std::span<const Box3f> boxes, size_t blocks, WideNodes& out);
 
 }  // namespace espalier

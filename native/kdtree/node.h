@@ -10,8 +10,11 @@ namespace espalier {
 /// Triangles are tested this many at a time, whatever the instruction set.
 constexpr uint32_t kBlockSize = 8;
 
-/// What the 26 bits of a wide leaf can count.
-constexpr size_t kMaxBlocks = size_t{1} << 26;
+/// Subtrees that may wait to be opened.
+constexpr uint32_t kMaxUnopened = 1U << 20;
+
+/// What the 26 bits of a wide leaf can count, but for the numbers that stand for those.
+constexpr size_t kMaxBlocks = (size_t{1} << 26) - kMaxUnopened;
 
 /// Blocks that hold `references` triangles.
 constexpr uint32_t block_count(uint32_t references) { return (references + kBlockSize - 1) / kBlockSize; }
@@ -57,13 +60,18 @@ struct alignas(64) WideNode {
 
     float lower[3][kWidth];  ///< unused lanes hold an inverted box, which no ray meets
     float upper[3][kWidth];
-    uint32_t child[kWidth];  ///< index of a wide node, or leaf(first_block, blocks)
+    uint32_t child[kWidth];  ///< index of a wide node, leaf(first_block, blocks), or unopened(number)
     uint32_t order[8];  ///< per ray octant (bit a: direction[a] < 0): eight ranks of 3 bits, the nearest child in the
                         ///< highest
 
     static constexpr uint32_t leaf(uint32_t first_block, uint32_t blocks) {
         return kLeafFlag | (first_block << 5) | (blocks - 1);
     }
+    /// A subtree that is built when the first ray enters it (see on_demand.h). All such codes exceed all others.
+    static constexpr uint32_t unopened(uint32_t number) { return leaf(static_cast<uint32_t>(kMaxBlocks) + number, 1); }
+    static constexpr bool is_unopened(uint32_t child) { return child >= unopened(0); }
+    static constexpr uint32_t number(uint32_t child) { return first_block(child) - static_cast<uint32_t>(kMaxBlocks); }
+
     static constexpr uint32_t first_block(uint32_t child) { return (child & ~kLeafFlag) >> 5; }
     static constexpr uint32_t blocks(uint32_t child) { return (child & 31U) + 1; }
 };

@@ -16,6 +16,7 @@
 #include <cstdint>
 
 #include "kdtree/candidate.h"
+#include "kdtree/on_demand.h"
 #include "kdtree/traced_ray-inl.h"
 #include "kdtree/triangle_test-inl.h"
 
@@ -31,7 +32,10 @@ class Packet {
     static constexpr size_t kRays = 2 * hn::MaxLanes(hn::CappedTag<float, 16>());
 
     explicit Packet(const Tree& tree)
-        : nodes_(tree.wide_nodes.data()), blocks_(tree.blocks.data()), extent_(extent_of(tree)) {}
+        : nodes_(tree.wide_nodes.data()),
+          blocks_(tree.blocks.data()),
+          on_demand_(tree.on_demand.get()),
+          extent_(extent_of(tree)) {}
 
     /// Sets the rays up if they make a packet.
     HWY_INLINE bool gather(const Ray* rays) {
@@ -58,6 +62,9 @@ class Packet {
         size_t stacked = 0;
         uint32_t child = 0;
         for (;;) {
+            if (WideNode::is_unopened(child)) [[unlikely]] {
+                child = on_demand_->open(child);
+            }
             if ((child & WideNode::kLeafFlag) == 0) {
                 const size_t pushed = visit_node(child, stacked);
                 for (size_t end = stacked + pushed; stacked != end; ++stacked) {
@@ -646,6 +653,7 @@ class Packet {
 
     const WideNode* nodes_;
     const TriangleBlock* blocks_;
+    OnDemand* on_demand_;
     const Ray* rays_ = nullptr;
     float extent_;
     bool is_reversed_ = false;  ///< the focus is where the rays end

@@ -116,7 +116,11 @@ template <bool kAnyHit, bool kExact>
 class Stream {
  public:
     Stream(const Tree& tree, std::span<const Ray> rays)
-        : nodes_(tree.wide_nodes.data()), blocks_(tree.blocks.data()), extent_(extent_of(tree)), rays_(rays) {}
+        : nodes_(tree.wide_nodes.data()),
+          blocks_(tree.blocks.data()),
+          on_demand_(tree.on_demand.get()),
+          extent_(extent_of(tree)),
+          rays_(rays) {}
 
     /// Traces the rays of these numbers and calls done(ray) for each when its way has ended.
     template <class Done>
@@ -139,6 +143,10 @@ class Stream {
             for (uint32_t i = 0; i < leaves; ++i) {
                 StreamRay& ray = *leaf_list_[i];
                 const uint32_t leaf = ray.next;
+                if (WideNode::is_unopened(leaf)) [[unlikely]] {
+                    go_on(ray, on_demand_->open(leaf));
+                    continue;
+                }
                 const uint32_t further = leaf % WideNode::kMaxLeafBlocks;  // blocks behind the first
                 const uint32_t block = WideNode::first_block(leaf);
                 Verdict verdict;
@@ -244,6 +252,7 @@ class Stream {
 
     const WideNode* nodes_;
     const TriangleBlock* blocks_;
+    OnDemand* on_demand_;
     float extent_;
     std::span<const Ray> rays_;
     uint32_t at_node_ = 0;

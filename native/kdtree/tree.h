@@ -3,6 +3,7 @@
 
 #include <atomic>
 #include <cstdint>
+#include <memory>
 #include <span>
 #include <stdexcept>
 
@@ -20,6 +21,9 @@ struct BuildOptions {
     Quality quality = Quality::kBalanced;
     int threads = 0;                            ///< 0: all the machine has
     const std::atomic<bool>* cancel = nullptr;  ///< set from another thread, makes build() throw BuildCancelled
+    /// In scenes of at least so many triangles, subtrees wait for the first ray that enters them. The triangles then
+    /// have to outlive the tree, which has no `nodes` and reports neither size nor cost; what rays hit is the same.
+    uint32_t on_demand_from = UINT32_MAX;
 };
 
 class BuildCancelled : public std::runtime_error {
@@ -74,6 +78,8 @@ struct BuildReport {
     uint64_t empty_leaves = 0;
     uint64_t references = 0;
     uint64_t wide_nodes = 0;
+    uint64_t subtrees = 0;  ///< on demand: how many waited, and how many of those were opened
+    uint64_t opened = 0;
     uint64_t bytes = 0;          ///< what the tree keeps: nodes, wide nodes and triangle blocks
     double sah_cost = 0;         ///< block model, in the units of the constants, per ray that meets the scene's box
     SahConstants sah_constants;  ///< of that cost: the same for every quality, even where its splits follow others
@@ -81,12 +87,15 @@ struct BuildReport {
     RejectedFaces rejected_faces;
 };
 
+class OnDemand;
+
 /// A kd-tree over triangles and the layout in which rays walk through it. It keeps its own copy of the triangles.
 struct Tree {
     Box3f bounds;
     LargeBuffer<KdNode> nodes;         ///< depth first; leaves point into blocks
     LargeBuffer<WideNode> wide_nodes;  ///< root first; empty for a tree without triangles
     LargeBuffer<TriangleBlock> blocks;
+    std::shared_ptr<OnDemand> on_demand;  ///< opens subtrees, where that was asked for
     BuildReport report;
 };
 

@@ -99,7 +99,7 @@ std::vector<Light> lights_from(const py::sequence& list, Vec3d scene_centre) {
 
 std::shared_ptr<Job> start_preview(const std::shared_ptr<Scene>& scene, py::handle camera, const py::sequence& lights,
                                    const std::array<double, 3>& world_color, int width, int height,
-                                   const std::string& quality, int threads, int samples) {
+                                   const std::string& quality, int threads, int samples, bool on_demand) {
     require_between(width, 1, kMaxSide, "width");
     require_between(height, 1, kMaxSide, "height");
     require_between(samples, 1, kMaxSamples, "samples");
@@ -108,7 +108,7 @@ std::shared_ptr<Job> start_preview(const std::shared_ptr<Scene>& scene, py::hand
         throw py::value_error("world_color must be finite");
     auto job =
         std::make_shared<PreviewJob>(scene, camera_from(camera, scene->centre()), lights_from(lights, scene->centre()),
-                                     width, height, quality_from(quality), settings);
+                                     width, height, quality_from(quality), on_demand, settings);
     start_job(job);
     return job;
 }
@@ -167,8 +167,9 @@ py::object image_of(const Job& job) {
 
 py::dict render(const std::shared_ptr<Scene>& scene, py::handle camera, const py::sequence& lights,
                 const std::array<double, 3>& world_color, int width, int height, const std::string& quality,
-                int threads, int samples) {
-    return result_of(*start_preview(scene, camera, lights, world_color, width, height, quality, threads, samples));
+                int threads, int samples, bool on_demand) {
+    return result_of(
+        *start_preview(scene, camera, lights, world_color, width, height, quality, threads, samples, on_demand));
 }
 
 }  // namespace
@@ -187,9 +188,10 @@ void bind_jobs(py::module_& module) {
 
     module.def("start_preview", &start_preview, "scene"_a, "camera"_a, "lights"_a, "world_color"_a, "width"_a,
                "height"_a, py::kw_only(), "quality"_a = "balanced", "threads"_a = 0, "samples"_a = 4,
-               docs::kStartPreview);
+               "on_demand"_a = false, docs::kStartPreview);
     module.def("render", &render, "scene"_a, "camera"_a, "lights"_a, "world_color"_a, "width"_a, "height"_a,
-               py::kw_only(), "quality"_a = "balanced", "threads"_a = 0, "samples"_a = 4, docs::kRender);
+               py::kw_only(), "quality"_a = "balanced", "threads"_a = 0, "samples"_a = 4, "on_demand"_a = false,
+               docs::kRender);
     module.def("start_compare", &start_compare, "scene"_a, "thread_counts"_a, py::kw_only(), "quality"_a = "balanced",
                "repeats"_a = 5, docs::kStartCompare);
 

@@ -23,7 +23,8 @@ inline constexpr const char* kBuild = R"(Builds a kd-tree over triangles.
 vertices: float32 [N, 3], any values. triangles: int32 or uint32 [M, 3], indices into vertices.
 quality: 'draft', 'balanced' or 'best': how long to look for good splits, never what a ray hits.
 'exact' tries them all, for comparison with the others.
-threads: 0 for all; the tree is the same, bit for bit, for any number.
+threads: 0 for all; the tree is the same, bit for bit, for any number. on_demand: subtrees of a large scene are built when the
+first ray enters them; the image is the same, and `build` then has neither sizes nor cost.
 Faces that are not finite, have no area or lie beyond 2^60 are counted in the report and left out.
 Raises TypeError for another dtype, ValueError for another shape, quality or number of threads,
 IndexError for an index out of range.)";

@@ -90,6 +90,7 @@ def start_preview(
     quality: str = "balanced",
     threads: int = 0,
     samples: int = 4,
+    on_demand: bool = False,
 ) -> Job: ...
 def render(
     scene: Scene,
@@ -102,6 +103,7 @@ def render(
     quality: str = "balanced",
     threads: int = 0,
     samples: int = 4,
+    on_demand: bool = False,
 ) -> dict[str, Any]: ...
 def start_compare(
     scene: Scene, thread_counts: Sequence[int], *, quality: str = "balanced", repeats: int = 5

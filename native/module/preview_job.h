@@ -13,12 +13,13 @@ namespace espalier {
 class PreviewJob final : public Job {
  public:
     PreviewJob(std::shared_ptr<const Scene> scene, const Camera& camera, std::vector<Light> lights, int width,
-               int height, Quality quality, const RenderSettings& settings)
+               int height, Quality quality, bool on_demand, const RenderSettings& settings)
         : scene_(std::move(scene)),
           camera_(camera),
           lights_(std::move(lights)),
           film_(width, height),
           quality_(quality),
+          on_demand_(on_demand),
           settings_(settings) {}
     ~PreviewJob() override { stop(); }
 
@@ -37,6 +38,7 @@ class PreviewJob final : public Job {
     std::vector<Light> lights_;
     Film film_;
     Quality quality_;
+    bool on_demand_;
     RenderSettings settings_;
     std::atomic<bool> built_{false};
     BuildReport build_report_;

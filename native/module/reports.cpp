@@ -73,7 +73,8 @@ py::dict report_dict(const BuildReport& report) {
         "build_ms"_a = report.build_ms, "phases_ms"_a = phases_dict(report.phases_ms), "threads"_a = report.threads,
         "triangles"_a = report.triangles, "nodes"_a = report.nodes, "leaves"_a = report.leaves,
         "empty_leaves"_a = report.empty_leaves, "references"_a = report.references, "wide_nodes"_a = report.wide_nodes,
-        "bytes"_a = report.bytes, "sah_cost"_a = report.sah_cost,
+        "subtrees"_a = report.subtrees, "opened"_a = report.opened, "bytes"_a = report.bytes,
+        "sah_cost"_a = report.sah_cost,
         "sah_constants"_a = py::dict("traversal"_a = sah.traversal, "block"_a = sah.block,
                                      "empty_bonus"_a = sah.empty_bonus, "max_depth"_a = sah.max_depth),
         "checksum"_a = hexadecimal(report.checksum), "rejected_faces"_a = rejected_dict(report.rejected_faces));

@@ -189,6 +189,19 @@ std::vector<Light> with_sky(std::span<const Light> lights, Vec3d world_color) {
     return all;
 }
 
+/// In which order tiles are drawn: as they lie, or such that one after the other is far from it, so that threads which
+/// open subtrees do not wait for one another.
+std::vector<size_t> tile_order(size_t count, bool far_apart) {
+    const size_t step = far_apart ? 16 : 1;
+    std::vector<size_t> order;
+    order.reserve(count);
+    for (size_t first = 0; first < step; ++first) {
+        for (size_t tile = first; tile < count; tile += step)
+            order.push_back(tile);
+    }
+    return order;
+}
+
 }  // namespace
 
 TraceReport render_picture(const Scene& scene, const Tree& tree, const Camera& camera, std::span<const Light> lights,
@@ -201,10 +214,11 @@ TraceReport render_picture(const Scene& scene, const Tree& tree, const Camera& c
     const std::vector<Light> all_lights = with_sky(lights, settings.world_color);
 
     std::atomic<uint64_t> shadow_rays{0};
-    parallel_for(report.threads, film.tiles().size(), [&](size_t i) {
+    const std::vector<size_t> order = tile_order(film.tiles().size(), tree.on_demand != nullptr);
+    parallel_for(report.threads, order.size(), [&](size_t i) {
         TileTracer tracer(scene, tree, camera, all_lights, settings, cancel);
-        shadow_rays.fetch_add(tracer.draw(film, film.tiles()[i]), std::memory_order_relaxed);
-        film.finish(i);
+        shadow_rays.fetch_add(tracer.draw(film, film.tiles()[order[i]]), std::memory_order_relaxed);
+        film.finish(order[i]);
     });
 
     report.primary_rays = static_cast<uint64_t>(film.width()) * static_cast<uint64_t>(film.height()) *

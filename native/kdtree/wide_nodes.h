@@ -1,0 +1,87 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+#pragma once
+
+#include <algorithm>
+#include <array>
+#include <bit>
+#include <cstddef>
+#include <cstdint>
+#include <span>
+
+#include "geometry/vec.h"
+#include "kdtree/large_buffer.h"
+#include "kdtree/node.h"
+
+namespace espalier {
+
+/// Wide nodes in the order in which they are made. Reserved for the worst case, taken page by page.
+class WideNodes {
+ public:
+    WideNodes() = default;
+    WideNodes(size_t capacity, size_t expected) : nodes_(capacity, expected * sizeof(WideNode)) {}
+    uint32_t add() { return count_++; }
+    uint32_t count() const { return count_; }
+    size_t capacity() const { return nodes_.size(); }
+    WideNode* data() { return nodes_.data(); }
+    void clear() { count_ = 0; }
+
+ private:
+    LargeBuffer<WideNode> nodes_;
+    uint32_t count_ = 0;
+};
+
+/// Surface area of a box, halved.
+inline float half_area(const Box3f& box) {
+    const Vec3f size = box.size();
+    return size.x * size.y + size.y * size.z + size.z * size.x;
+}
+
+/// In which order rays of each octant meet the children of a wide node, while it opens from one to eight of them.
+class ChildOrder {
+ public:
+    /// A child gives way to two: the one below a plane of `axis` takes its slot, the other slot `added`. The near one
+    /// comes first in each octant, and everything nearer moves up by one.
+    void split(int axis, int slot, int added) {
+        for (unsigned octant = 0; octant < 8; ++octant) {
+            const bool left_is_nearer = (octant >> axis & 1U) == 0;
+            const auto near = static_cast<uint32_t>(left_is_nearer ? slot : added);
+            const auto far = static_cast<uint32_t>(left_is_nearer ? added : slot);
+            // The lowest nibble that equals the slot.
+            const uint32_t differing = order_[octant] ^ (static_cast<uint32_t>(slot) * 0x11111111U);
+            const int shift = std::countr_zero((differing - 0x11111111U) & ~differing & 0x88888888U) - 3;
+            const uint32_t farther = order_[octant] & ((1U << shift) - 1);
+            const auto nearer = static_cast<uint32_t>(uint64_t{order_[octant]} >> (shift + 4) << (shift + 8));
+            order_[octant] = nearer | (near << (shift + 4)) | (far << shift) | farther;
+        }
+    }
+
+    /// Fills in all of a node but its children: where there are none, no ray gets.
+    void write(std::span<const Box3f> boxes, WideNode& node) const {
+        const auto count = static_cast<int>(boxes.size());
+        std::fill_n(node.child, WideNode::kWidth, WideNode::leaf(0, 1));
+        for (int i = 0; i < WideNode::kWidth; ++i) {
+            const Box3f box = i < count ? boxes[static_cast<size_t>(i)] : Box3f{};
+            for (int axis = 0; axis < 3; ++axis) {
+                node.lower[axis][i] = box.lower[axis];
+                node.upper[axis][i] = box.upper[axis];
+            }
+        }
+        for (size_t octant = 0; octant < 8; ++octant) {
+            // Unused slots come first, that is farthest: no ray meets them, but each slot has to appear once.
+            uint32_t word = 0;
+            int place = 0;
+            for (int slot = count; slot < WideNode::kWidth; ++slot) {
+                word |= static_cast<uint32_t>(slot) << (3 * place++);
+            }
+            for (int rank = 0; rank < count; ++rank) {
+                word |= (order_[octant] >> (4 * rank) & 7U) << (3 * place++);
+            }
+            node.order[octant] = word;
+        }
+    }
+
+ private:
+    std::array<uint32_t, 8> order_{};  ///< per octant the slots, 4 bits each, the farthest lowest
+};
+
+}  // namespace espalier
