@@ -111,8 +111,8 @@ def test_clip_range_holds(projection: str) -> None:
 
 def test_picture_of_a_tree_opened_on_demand_is_the_same() -> None:
     ball = mesh(*sphere(60, 90))
-    row = scene([ball], [placed(moved(3.0 * i, 0, 0)) for i in range(50)])
-    assert row.triangle_count > 500_000
+    row = scene([ball], [placed(moved(3.0 * i, 0, 0)) for i in range(200)])
+    assert row.triangle_count > 2_000_000
     view = camera(looking((0, -6, 1), (0, 0, 0)), VIEWS["perspective"])
     drawn = {
         on_demand: espalier_native.render(row, view, [], BACKGROUND, 48, 36, samples=2, on_demand=on_demand)

@@ -93,7 +93,8 @@ def draw_builds(measured: Part) -> Figure:
     """Build time against SAH excess, a panel for each mesh."""
     meshes = list(dict.fromkeys(row["mesh"] for row in measured["rows"]))
     figure, panels = plt.subplots(1, len(meshes), figsize=(3.1 * len(meshes), 3.4), sharey=True, squeeze=False)
-    top = max([row["sah_excess_percent"] or 0.0 for row in measured["rows"]] + [1.0])
+    excesses = [row["sah_excess_percent"] or 0.0 for row in measured["rows"]]
+    top, bottom = max(*excesses, 1.0), min(*excesses, 0.0)
     for axes, mesh in zip(panels[0], meshes, strict=True):
         rows = [row for row in measured["rows"] if row["mesh"] == mesh]
         ours = sorted((r for r in rows if r["sah_excess_percent"] is not None), key=lambda r: float(r["build_ms"]))
@@ -115,7 +116,7 @@ def draw_builds(measured: Part) -> Figure:
                 axes.text(row["build_ms"], 1.7 * top, row["builder"], rotation=90, ha="right", va="top", fontsize=8,
                           color=THEIRS)  # fmt: skip
         times = [float(row["build_ms"]) for row in rows]
-        axes.set(xscale="log", xlim=(min(times) / 1.6, max(times) * 1.8), ylim=(-0.08 * top, 1.72 * top))
+        axes.set(xscale="log", xlim=(min(times) / 1.6, max(times) * 1.8), ylim=(bottom - 0.08 * top, 1.72 * top))
         axes.set_title(f"{mesh}, {rows[0]['triangles']:,} triangles")
         axes.set_xlabel("build time, ms")
         plain_numbers(axes, "x")

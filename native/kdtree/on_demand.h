@@ -14,7 +14,7 @@ namespace espalier {
 
 /// Triangles from which on a picture is there sooner if subtrees wait: in smaller scenes most are opened by some ray,
 /// and opening costs more than building all at once.
-constexpr uint32_t kOnDemandPays = 500'000;
+constexpr uint32_t kOnDemandPays = 2'000'000;
 
 /// A tree of which only the top is built; every subtree below waits for the first ray that enters it (Wald, Friedrich,
 /// Marmitt, Slusallek and Seidel 2005 build so too, within a frame; Hunt, Mark and Fussell 2007 lazily). A large one is
