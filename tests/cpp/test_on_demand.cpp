@@ -43,7 +43,8 @@ std::vector<Ray> make_fan(Vec3f eye, Vec3f towards, size_t count) {
     std::vector<Ray> rays;
     for (size_t i = 0; i < count; ++i) {
         const auto x = static_cast<float>(i % 4) * 0.002F;
-        const auto y = static_cast<float>(i / 4) * 0.002F;
+        const size_t row = i / 4;
+        const auto y = static_cast<float>(row) * 0.002F;
         rays.push_back({eye, 0, towards + Vec3f{x, y, 0}, INFINITY});
     }
     return rays;
