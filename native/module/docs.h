@@ -23,8 +23,7 @@ inline constexpr const char* kBuild = R"(Builds a kd-tree over triangles.
 vertices: float32 [N, 3], any values. triangles: int32 or uint32 [M, 3], indices into vertices.
 quality: 'draft', 'balanced' or 'best': how long to look for good splits, never what a ray hits.
 'exact' tries them all, for comparison with the others.
-threads: 0 for all; the tree is the same, bit for bit, for any number. on_demand: subtrees of a large scene are built when the
-first ray enters them; the image is the same, and `build` then has neither sizes nor cost.
+threads: 0 for all; the tree is the same, bit for bit, for any number.
 Faces that are not finite, have no area or lie beyond 2^60 are counted in the report and left out.
 Raises TypeError for another dtype, ValueError for another shape, quality or number of threads,
 IndexError for an index out of range.)";
@@ -37,7 +36,8 @@ inline constexpr const char* kReport = R"(What the build took and what came of i
 build_ms and phases_ms {bounds, top_levels, subtrees, compaction, layout}: wall-clock milliseconds.
 threads; triangles (as given); nodes; leaves; empty_leaves; references (of leaves to triangles);
 wide_nodes; bytes. sah_cost: expected cost of a ray that meets the scene's box, in the units of
-sah_constants, which are the same for every quality. checksum: 16 hexadecimal digits, the same for any number of threads.
+sah_constants, which are the same for every quality. subtrees, opened: 0, but for a picture drawn on
+demand. checksum: 16 hexadecimal digits, the same for any number of threads.
 rejected_faces {not_finite, no_area, too_large}: faces that no ray can hit, left out of the tree.)";
 
 inline constexpr const char* kIntersect =
@@ -120,7 +120,9 @@ angle in rad; spot: spot_size in rad, spot_blend 0..1; area: shape 'SQUARE', 'RE
 'ELLIPSE', size and size_y in m. Their units and falloffs are those of Cycles.
 world_color: linear RGB of the background; it lights the scene too. Without lights a soft sky does.
 width, height: pixels. quality: of the tree. samples: rays per pixel. threads: 0 for all; the image
-is the same, bit for bit, for any number.
+is the same, bit for bit, for any number. on_demand: in scenes of two million triangles and more,
+subtrees are built when the first ray enters them; the image is the same, and `build` then has no
+sizes and no cost of the tree, but how many subtrees waited and how many were opened.
 Returns a dict. image: float32 [H, W, 4] linear RGBA, bottom row first. build: as Tree.report.
 trace: trace_ms, threads, samples, primary_rays, shadow_rays, mrays_per_s. placing_ms.
 objects: as Scene.objects.
