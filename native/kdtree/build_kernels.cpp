@@ -47,7 +47,7 @@ class SubtreeBuilder {
         }
         const Split split = search_(node, references);
         if (split.axis < 0) {
-            write_leaf(node, references);
+            output_.add_leaf({references.triangle, node.count}, node.tight);
             return;
         }
         Partition parts;
@@ -116,11 +116,6 @@ class SubtreeBuilder {
         SubtreeBuilder(input, output_).build(node, 0, node.count);
     }
 
-    void write_leaf(const OpenNode& node, const References& references) {
-        std::copy_n(references.triangle, node.count, output_.add_leaf(node.count));
-        output_.last_box() = node.tight;
-    }
-
     const SubtreeInput& input_;
     SubtreeOutput& output_;
     SplitSearch search_{*input_.parameters};
@@ -132,8 +127,12 @@ void build_subtree(const SubtreeInput& input, const OpenNode& node, SubtreeOutpu
     SubtreeBuilder(input, output).build(node, 0, node.count);
 }
 
-constexpr BuildKernels kKernels{make_references,    count_bins, count_bins_along, choose_split,
-                                choose_finer_split, partition,  build_subtree,    write_blocks};
+Split find_split(const OpenNode& node, const References& references, const BuildParameters& parameters) {
+    return SplitSearch(parameters)(node, references);
+}
+
+constexpr BuildKernels kKernels{make_references, count_bins, count_bins_along, choose_split, choose_finer_split,
+                                find_split,      partition,  build_subtree,    write_blocks};
 
 }  // namespace espalier::HWY_NAMESPACE
 HWY_AFTER_NAMESPACE();

@@ -103,6 +103,8 @@ struct BuildKernels {
     /// The cheapest of a split and the planes that cut an interval around it.
     Split (*choose_finer_split)(const OpenNode& node, Split split, Interval range, const BinCounts& counts,
                                 const BuildParameters& parameters);
+    /// The plane that a node is split at, or a leaf: all of the above on one thread, as far as the parameters ask.
+    Split (*find_split)(const OpenNode& node, const References& references, const BuildParameters& parameters);
     /// Sorts references by side, in order; those on both sides go to both. `left` may be `in` itself.
     Partition (*partition)(const TriangleSoup& soup, const References& in, uint32_t count, Split split, bool clip,
                            const References& left, const References& right);

@@ -39,7 +39,7 @@ class CarefulNode {
     float build(const OpenNode& node, const References& references, size_t room = 0) {
         const float leaf_cost = block_cost_ * static_cast<float>(block_count(node.count));
         if (leaf_cost <= traversal_cost_) {
-            write_leaf(node, references);
+            output_.add_leaf({references.triangle, node.count}, node.tight);
             return leaf_cost;
         }
         if (node.count <= input_.parameters->small_node) {
@@ -47,8 +47,11 @@ class CarefulNode {
         }
         const Split split = search_(node, references);
         if (split.axis < 0) {
-            write_leaf(node, references);
+            output_.add_leaf({references.triangle, node.count}, node.tight);
             return leaf_cost;
+        }
+        if (children_.references().triangle == nullptr) {
+            children_ = ReferenceBuffer(size_t{8} * kCapacity);  // rarely half of it is used
         }
         const size_t right_room = room + node.count + kMargin;
         if (right_room + node.count > children_.capacity()) {
@@ -77,7 +80,7 @@ class CarefulNode {
         const float cost = traversal_cost_ + (area(left) * left_cost + area(right) * right_cost);
         if (leaf_cost <= cost) {
             output_.rewind(index, first_triangle);
-            write_leaf(node, references);
+            output_.add_leaf({references.triangle, node.count}, node.tight);
             return leaf_cost;
         }
         output_.close_inner(index, split, right_child);
@@ -87,17 +90,12 @@ class CarefulNode {
  private:
     static constexpr uint32_t kMargin = 16;  ///< references that vector code may write past the end
 
-    void write_leaf(const OpenNode& node, const References& references) {
-        std::copy_n(references.triangle, node.count, output_.add_leaf(node.count));
-        output_.last_box() = node.tight;
-    }
-
     const SubtreeInput& input_;
     SplitSearch& search_;
     SubtreeOutput& output_;
     float traversal_cost_;
     float block_cost_;
-    ReferenceBuffer children_{size_t{8} * kCapacity};  ///< rarely half of it is used
+    ReferenceBuffer children_;  ///< made when a node is first split: most subtrees come without such nodes
 };
 
 }  // namespace espalier::HWY_NAMESPACE

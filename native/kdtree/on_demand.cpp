@@ -170,18 +170,6 @@ std::unique_ptr<OnDemand::Scratch> OnDemand::take_scratch() {
     return taken;
 }
 
-Split OnDemand::choose_split(const OpenNode& node, const References& references) const {
-    BinCounts counts{};
-    kernels_.count_bins(references, node.count, node.tight, counts);
-    Split split = kernels_.choose_split(node, counts, parameters_);
-    if (Interval range; parameters_.search != Search::kSlices && finer_range(node, split, range)) {
-        counts = {};
-        kernels_.count_bins_along(split.axis, references, node.count, range.lower, range.upper, counts);
-        split = kernels_.choose_finer_split(node, split, range, counts, parameters_);
-    }
-    return split;
-}
-
 /// Splits a node into the children of one wide node, which wait to be opened. Left children stay where their parent's
 /// references lie in the scratch room, right ones go behind all others.
 uint32_t OnDemand::divide(const OpenNode& node, Scratch& scratch) {
@@ -208,7 +196,7 @@ uint32_t OnDemand::divide(const OpenNode& node, Scratch& scratch) {
             break;
         }
         const OpenNode parent = widest->node;
-        const Split split = choose_split(parent, at(widest->begin));
+        const Split split = kernels_.find_split(parent, at(widest->begin), parameters_);
         if (split.axis < 0) {
             widest->is_final = true;
             continue;

@@ -57,7 +57,6 @@ class OnDemand {
     uint32_t new_part(const OpenNode& node, const TopNode* top, const References& references);
     uint32_t build(Part& part);
     std::unique_ptr<Scratch> take_scratch();
-    Split choose_split(const OpenNode& node, const References& references) const;
     uint32_t divide(const OpenNode& node, Scratch& scratch);
     uint32_t build_whole(const OpenNode& node, Scratch& scratch);
     uint32_t append(WideNodes& wide, std::span<const uint32_t> triangles);

@@ -82,6 +82,11 @@ class SubtreeOutput {
         std::fill(triangles_ + first + references, triangles_ + triangle_count_, kNoTriangle);
         return triangles_ + first;
     }
+    /// Appends a leaf of these triangles, with its tight box.
+    void add_leaf(std::span<const uint32_t> triangles, const Box3f& box) {
+        std::copy(triangles.begin(), triangles.end(), add_leaf(static_cast<uint32_t>(triangles.size())));
+        last_box() = box;
+    }
     Box3f& last_box() { return boxes_[node_count_ - 1]; }
     /// Takes back what was appended since the counts were these.
     void rewind(size_t nodes, size_t triangles) {
