@@ -1,6 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 #include "geometry/exact_hit.h"
 
+#include <algorithm>
+#include <iterator>
+
 #include "geometry/expansion.h"
 
 namespace espalier {
@@ -140,6 +143,9 @@ int compare_distance(Vec3f origin, Vec3f direction, const ExactHit& a, const Exa
     const double margin = 1.0 + 0x1p-50;  // for the rounding of this comparison itself
     if (std::abs(a.t - b.t) > (a.error + b.error) * margin) {
         return a.t < b.t ? -1 : 1;
+    }
+    if (std::is_permutation(std::begin(a.corner), std::end(a.corner), std::begin(b.corner))) {
+        return 0;  // faces that are there twice
     }
     const Quotient x = exact_distance(origin, direction, a.corner);
     const Quotient y = exact_distance(origin, direction, b.corner);

@@ -14,143 +14,133 @@
 #include <bit>
 #include <cstdint>
 #include <span>
+#include <type_traits>
 
 #include "kdtree/candidate.h"
+#include "kdtree/traced_ray-inl.h"
+#include "kdtree/triangle_test-inl.h"
 
 HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
 namespace hn = hwy::HWY_NAMESPACE;
 
-/// Rays and the triangles they hit, side by side.
+/// Rays and the triangles they hit.
 struct alignas(64) FinishBatch {
-    static constexpr size_t kSize = 8;
-    float origin[3][kSize];
-    float direction[3][kSize];
+    static constexpr size_t kSize = 16;
+    float origin[kSize][4];     ///< and t_min, which is not needed
+    float direction[kSize][4];  ///< and t_max
     float corner[3][3][kSize];  ///< [corner][axis][lane]
     float t[kSize];
     float u[kSize];
     float v[kSize];
+
+    HWY_INLINE void put(size_t lane, const Ray& ray, const TriangleBlock* blocks, uint32_t place) {
+        const hn::CappedTag<float, 4> d;
+        hn::Store(hn::LoadU(d, &ray.origin.x), d, origin[lane]);
+        hn::Store(hn::LoadU(d, &ray.direction.x), d, direction[lane]);
+        const float* from = blocks[place / kBlockSize].vertex[0][0] + place % kBlockSize;
+        for (size_t k = 0; k < 3; ++k) {
+            for (size_t axis = 0; axis < 3; ++axis) {
+                corner[k][axis][lane] = from[(k * 3 + axis) * kBlockSize];
+            }
+        }
+    }
 };
 
-/// Fills in t, u and v; returns the lanes for which double does not suffice. No operation is fused, so that every
+/// Fills in t, u and v; returns the lanes for which T does not suffice. No operation is fused, so that every
 /// instruction set takes the same way.
 ///
-/// As in exact_hit.cpp: an edge function is off by less than 2^-49 times the sum of its terms' sizes. Where each
-/// outweighs its error and their sum 2^24 times its own, u and v are off by less than 2^-22.9. The error of t adds what
-/// those of the weights move it among the corners, and 16 roundings of the largest coordinate along the ray.
-HWY_INLINE uint32_t finish_in_double(FinishBatch& batch) {
-    const hn::CappedTag<double, FinishBatch::kSize> d;
+/// Sheared as in the float filter, but in double, and times the direction's z, which saves a division. With e = 2^-53
+/// and m = mz |direction z|, an edge function is then off by less than e s (4.25 s + 8.5 m) = bound (EXACTNESS.md, 12).
+/// Where each outweighs that, all have their true signs. Errors of the weights move the depth by less than 3.25 bound /
+/// |det| times what the corners lie apart, at most 2 mz, and other roundings by 2^-49 mz. Float, for the path that does
+/// without exactness, is taken as it comes.
+template <class T>
+HWY_INLINE uint32_t finish(FinishBatch& batch) {
+    constexpr bool kExact = sizeof(T) == sizeof(double);
+    const hn::CappedTag<T, FinishBatch::kSize> d;
     const hn::Rebind<float, decltype(d)> df;
-    constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<double, FinishBatch::kSize>());
+    constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<T, FinishBatch::kSize>());
     using V = hn::Vec<decltype(d)>;
+    using VF = hn::Vec<decltype(df)>;
     uint32_t open = 0;
     for (size_t first = 0; first < FinishBatch::kSize; first += kLanes) {
-        const auto load = [&](const float* from) { return hn::PromoteTo(d, hn::Load(df, from + first)); };
-        V dir[3];
-        V p[3][3];
-        V edge[3][3];  // opposite corner k
-        for (size_t axis = 0; axis < 3; ++axis) {
-            const V origin = load(batch.origin[axis]);
-            dir[axis] = load(batch.direction[axis]);
-            const V corner[3] = {load(batch.corner[0][axis]), load(batch.corner[1][axis]), load(batch.corner[2][axis])};
-            for (size_t k = 0; k < 3; ++k) {
-                p[k][axis] = hn::Sub(corner[k], origin);
-                edge[k][axis] = hn::Sub(corner[(k + 2) % 3], corner[(k + 1) % 3]);
+        VF unused;
+        VF origin[3];
+        VF direction[3];
+        hn::LoadInterleaved4(df, batch.origin[first], origin[0], origin[1], origin[2], unused);
+        hn::LoadInterleaved4(df, batch.direction[first], direction[0], direction[1], direction[2], unused);
+        const VF size[3] = {hn::Abs(direction[0]), hn::Abs(direction[1]), hn::Abs(direction[2])};
+        const auto x_over_y = hn::Gt(size[0], size[1]);
+        const auto not_z = hn::Gt(hn::Max(size[0], size[1]), size[2]);
+        // The axes in such an order that z has the direction's largest component.
+        const auto permute = [&](const VF(&from)[3], V(&to)[3]) {
+            for (size_t axis = 0; axis < 3; ++axis) {
+                const VF permuted = hn::IfThenElse(
+                    not_z, hn::IfThenElse(x_over_y, from[(axis + 1) % 3], from[(axis + 2) % 3]), from[axis]);
+                if constexpr (kExact) {
+                    to[axis] = hn::PromoteTo(d, permuted);
+                } else {
+                    to[axis] = permuted;
+                }
+            }
+        };
+        V from[3];
+        V along[3];
+        permute(origin, from);
+        permute(direction, along);
+        const auto store = [&](V value, float* to) {
+            if constexpr (kExact) {
+                hn::Store(hn::DemoteTo(df, value), df, to + first);
+            } else {
+                hn::Store(value, d, to + first);
+            }
+        };
+        V z[3];
+        V across[2][3];
+        for (size_t k = 0; k < 3; ++k) {
+            const VF given[3] = {hn::Load(df, batch.corner[k][0] + first), hn::Load(df, batch.corner[k][1] + first),
+                                 hn::Load(df, batch.corner[k][2] + first)};
+            V corner[3];
+            permute(given, corner);
+            z[k] = hn::Sub(corner[2], from[2]);
+            for (size_t axis = 0; axis < 2; ++axis) {
+                const V seen = hn::Sub(corner[axis], from[axis]);
+                across[axis][k] = hn::Sub(hn::Mul(seen, along[2]), hn::Mul(along[axis], z[k]));
             }
         }
+        const V(&x)[3] = across[0];
+        const V(&y)[3] = across[1];
         V side[3];
-        V side_error[3];
         for (size_t k = 0; k < 3; ++k) {
-            const V(&a)[3] = p[(k + 1) % 3];
-            const V(&b)[3] = edge[k];
-            V value[3];
-            V size[3];
-            for (size_t axis = 0; axis < 3; ++axis) {
-                const V left = hn::Mul(a[(axis + 1) % 3], b[(axis + 2) % 3]);
-                const V right = hn::Mul(a[(axis + 2) % 3], b[(axis + 1) % 3]);
-                value[axis] = hn::Mul(dir[axis], hn::Sub(left, right));
-                size[axis] = hn::Mul(hn::Abs(dir[axis]), hn::Add(hn::Abs(left), hn::Abs(right)));
-            }
-            side[k] = hn::Add(hn::Add(value[0], value[1]), value[2]);
-            side_error[k] = hn::Mul(hn::Add(hn::Add(size[0], size[1]), size[2]), hn::Set(d, 0x1p-49));
+            const size_t a = (k + 1) % 3;
+            const size_t b = (k + 2) % 3;
+            side[k] = hn::Sub(hn::Mul(x[b], y[a]), hn::Mul(y[b], x[a]));
         }
         const V det = hn::Add(hn::Add(side[0], side[1]), side[2]);
-        const V error = hn::Add(hn::Add(side_error[0], side_error[1]), side_error[2]);
-
-        const auto x_over_y = hn::Gt(hn::Abs(dir[0]), hn::Abs(dir[1]));
-        const V larger = hn::IfThenElse(x_over_y, dir[0], dir[1]);
-        const auto is_z = hn::Le(hn::Abs(larger), hn::Abs(dir[2]));
-        const V along = hn::IfThenElse(is_z, dir[2], larger);
-        V z[3];
-        for (size_t k = 0; k < 3; ++k) {
-            z[k] = hn::IfThenElse(is_z, p[k][2], hn::IfThenElse(x_over_y, p[k][0], p[k][1]));
+        const V scale = hn::Div(hn::Set(d, 1), hn::Mul(det, along[2]));
+        const V per_det = hn::Mul(scale, along[2]);
+        const V depth_sum = hn::Add(hn::Add(hn::Mul(side[0], z[0]), hn::Mul(side[1], z[1])), hn::Mul(side[2], z[2]));
+        const V t = hn::Mul(depth_sum, scale);
+        if constexpr (kExact) {
+            const V mz = largest_of(z);
+            const V m = hn::Mul(mz, hn::Abs(along[2]));
+            const V s = hn::Add(hn::Add(largest_of(x), largest_of(y)), hn::Mul(m, hn::Set(d, 5.5 * 0x1p-53)));
+            const V bound =
+                hn::Mul(s, hn::Add(hn::Mul(s, hn::Set(d, 4.25 * 0x1p-53)), hn::Mul(m, hn::Set(d, 8.5 * 0x1p-53))));
+            // The depth's error against 2^-28 of it, both times |det|.
+            const V error =
+                hn::Mul(mz, hn::Add(hn::Mul(bound, hn::Set(d, 6.5)), hn::Mul(hn::Abs(det), hn::Set(d, 0x1p-49))));
+            const auto t_sure = hn::And(hn::Le(error, hn::Mul(hn::Abs(depth_sum), hn::Set(d, 0x1p-28))),
+                                        hn::Le(hn::Abs(t), hn::Set(d, double{std::numeric_limits<float>::max()})));
+            const auto sure = hn::And(t_sure, hn::Gt(smallest_of(side), bound));
+            open |= (~mask_bits(d, sure) & ((1U << kLanes) - 1)) << first;
         }
-        const V spread = hn::Sub(hn::Max(z[0], hn::Max(z[1], z[2])), hn::Min(z[0], hn::Min(z[1], z[2])));
-        const V size = hn::Max(hn::Abs(z[0]), hn::Max(hn::Abs(z[1]), hn::Abs(z[2])));
-        const V scale = hn::Div(hn::Set(d, 1), hn::Mul(det, along));
-        const V per_det = hn::Mul(scale, along);
-        const V t =
-            hn::Mul(hn::Add(hn::Add(hn::Mul(side[0], z[0]), hn::Mul(side[1], z[1])), hn::Mul(side[2], z[2])), scale);
-        // In depth: 1.01 error spread / |det| + 2^-49 size, against 2^-28 of the depth.
-        const V depth_error = hn::Add(hn::Mul(hn::Mul(error, hn::Set(d, 1.0625)), hn::Mul(spread, hn::Abs(per_det))),
-                                      hn::Mul(size, hn::Set(d, 0x1p-49)));
-        const V allowed = hn::Mul(hn::Abs(hn::Mul(t, along)), hn::Set(d, 0x1p-28));
-        const auto sides_sure = hn::And(
-            hn::And(hn::Gt(hn::Abs(side[0]), side_error[0]), hn::Gt(hn::Abs(side[1]), side_error[1])),
-            hn::And(hn::Gt(hn::Abs(side[2]), side_error[2]), hn::Ge(hn::Abs(det), hn::Mul(error, hn::Set(d, 0x1p24)))));
-        const auto sure =
-            hn::And(sides_sure, hn::And(hn::Le(depth_error, allowed),
-                                        hn::Le(hn::Abs(t), hn::Set(d, double{std::numeric_limits<float>::max()}))));
-        hn::Store(hn::DemoteTo(df, t), df, batch.t + first);
-        hn::Store(hn::DemoteTo(df, hn::Mul(side[1], per_det)), df, batch.u + first);
-        hn::Store(hn::DemoteTo(df, hn::Mul(side[2], per_det)), df, batch.v + first);
-        uint8_t bits[8] = {};
-        hn::StoreMaskBits(d, sure, bits);
-        const auto all = (1U << kLanes) - 1;
-        open |= (~static_cast<uint32_t>(bits[0]) & all) << first;
+        store(t, batch.t);
+        store(hn::Mul(side[1], per_det), batch.u);
+        store(hn::Mul(side[2], per_det), batch.v);
     }
     return open;
-}
-
-/// The same in float, for the path that does without exactness.
-HWY_INLINE void finish_in_float(FinishBatch& batch) {
-    const hn::CappedTag<float, FinishBatch::kSize> d;
-    constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<float, FinishBatch::kSize>());
-    using V = hn::Vec<decltype(d)>;
-    for (size_t first = 0; first < FinishBatch::kSize; first += kLanes) {
-        V p[3][3];
-        V dir[3];
-        for (size_t axis = 0; axis < 3; ++axis) {
-            dir[axis] = hn::Load(d, batch.direction[axis] + first);
-            for (size_t k = 0; k < 3; ++k) {
-                p[k][axis] =
-                    hn::Sub(hn::Load(d, batch.corner[k][axis] + first), hn::Load(d, batch.origin[axis] + first));
-            }
-        }
-        const auto side = [&](const V(&a)[3], const V(&b)[3]) {
-            V sum = hn::Zero(d);
-            for (size_t axis = 0; axis < 3; ++axis) {
-                const size_t y = (axis + 1) % 3;
-                const size_t z = (axis + 2) % 3;
-                sum = hn::MulAdd(dir[axis], hn::MulSub(a[y], b[z], hn::Mul(a[z], b[y])), sum);
-            }
-            return sum;
-        };
-        const V u = side(p[2], p[0]);
-        const V v = side(p[0], p[1]);
-        const V w = side(p[1], p[2]);
-        const V inverse = hn::Div(hn::Set(d, 1), hn::Add(u, hn::Add(v, w)));
-        V along = hn::Zero(d);
-        V square = along;
-        for (size_t axis = 0; axis < 3; ++axis) {
-            const V point = hn::MulAdd(u, p[1][axis], hn::MulAdd(v, p[2][axis], hn::Mul(w, p[0][axis])));
-            along = hn::MulAdd(hn::Mul(point, inverse), dir[axis], along);
-            square = hn::MulAdd(dir[axis], dir[axis], square);
-        }
-        hn::Store(hn::Div(along, square), d, batch.t + first);
-        hn::Store(hn::Mul(u, inverse), d, batch.u + first);
-        hn::Store(hn::Mul(v, inverse), d, batch.v + first);
-    }
 }
 
 /// Hits that wait to be finished together.
@@ -161,40 +151,27 @@ class FinishQueue {
         : blocks_(blocks), rays_(rays), hits_(hits) {}
 
     HWY_INLINE void add(uint32_t ray, uint32_t place) {
-        ray_[count_] = ray;
-        place_[count_] = place;
-        if (++count_ == FinishBatch::kSize) {
+        // Not as soon as it is full: what was just written lane by lane cannot be read as a vector at once.
+        if (count_ == FinishBatch::kSize) {
             flush();
         }
+        batch_.put(count_, rays_[ray], blocks_, place);
+        ray_[count_] = ray;
+        place_[count_] = place;
+        ++count_;
     }
 
     HWY_NOINLINE void flush() {
         if (count_ == 0) {
             return;
         }
-        FinishBatch batch;
-        for (size_t i = 0; i < FinishBatch::kSize; ++i) {
-            const size_t from = i < count_ ? i : 0;
-            const Ray& ray = rays_[ray_[from]];
-            const TriangleBlock& block = blocks_[place_[from] / kBlockSize];
-            const uint32_t lane = place_[from] % kBlockSize;
-            for (size_t axis = 0; axis < 3; ++axis) {
-                batch.origin[axis][i] = ray.origin[static_cast<int>(axis)];
-                batch.direction[axis][i] = ray.direction[static_cast<int>(axis)];
-                for (size_t k = 0; k < 3; ++k) {
-                    batch.corner[k][axis][i] = block.vertex[k][axis][lane];
-                }
-            }
+        for (size_t lane = count_; lane < FinishBatch::kSize; ++lane) {
+            batch_.put(lane, rays_[ray_[0]], blocks_, place_[0]);
         }
-        uint32_t open = 0;
-        if constexpr (kExact) {
-            open = finish_in_double(batch);
-        } else {
-            finish_in_float(batch);
-        }
+        const uint32_t open = finish<std::conditional_t<kExact, double, float>>(batch_);
         for (size_t i = 0; i < count_; ++i) {
             const uint32_t ray = ray_[i];
-            hits_[ray] = {batch.t[i], batch.u[i], batch.v[i], static_cast<int32_t>(triangle_at(blocks_, place_[i]))};
+            hits_[ray] = {batch_.t[i], batch_.u[i], batch_.v[i], static_cast<int32_t>(triangle_at(blocks_, place_[i]))};
         }
         for (uint32_t rest = open & ((1U << count_) - 1); rest != 0; rest &= rest - 1) {
             const auto i = static_cast<size_t>(std::countr_zero(rest));
@@ -207,6 +184,7 @@ class FinishQueue {
     const TriangleBlock* blocks_;
     std::span<const Ray> rays_;
     std::span<Hit> hits_;
+    FinishBatch batch_;
     uint32_t ray_[FinishBatch::kSize];
     uint32_t place_[FinishBatch::kSize];
     size_t count_ = 0;

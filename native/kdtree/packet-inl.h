@@ -16,6 +16,7 @@
 #include <cstdint>
 
 #include "kdtree/candidate.h"
+#include "kdtree/focus_view-inl.h"
 #include "kdtree/on_demand.h"
 #include "kdtree/traced_ray-inl.h"
 #include "kdtree/triangle_test-inl.h"
@@ -93,6 +94,7 @@ class Packet {
     uint32_t place(size_t lane) const { return place_[lane]; }
 
  private:
+    using View = FocusView<kExact>;
     using D = hn::CappedTag<float, 16>;
     using V = hn::Vec<D>;
     static constexpr D d{};                         // NOLINT(readability-identifier-naming): as in functions
@@ -161,8 +163,8 @@ class Packet {
         const int kx = kz == 2 ? 0 : kz + 1;
         const int ky = kx == 2 ? 0 : kx + 1;
         const Vec3f far_end{direction_[0][kRays - 1], direction_[1][kRays - 1], direction_[2][kRays - 1]};
-        slope_x_ = 0.5F * (towards[kx] / towards[kz] + far_end[kx] / far_end[kz]);
-        slope_y_ = 0.5F * (towards[ky] / towards[kz] + far_end[ky] / far_end[kz]);
+        focus_.slope_x = 0.5F * (towards[kx] / towards[kz] + far_end[kx] / far_end[kz]);
+        focus_.slope_y = 0.5F * (towards[ky] / towards[kz] + far_end[ky] / far_end[kz]);
         V widest_x = hn::Zero(d);
         V widest_y = hn::Zero(d);
         for (size_t lane = 0; lane < kRays; lane += kLanes) {
@@ -178,28 +180,30 @@ class Packet {
             }
             const V sx = hn::Div(dx, dz);
             const V sy = hn::Div(dy, dz);
-            const V off_x = hn::Sub(sx, hn::Set(d, slope_x_));
-            const V off_y = hn::Sub(sy, hn::Set(d, slope_y_));
+            const V off_x = hn::Sub(sx, hn::Set(d, focus_.slope_x));
+            const V off_y = hn::Sub(sy, hn::Set(d, focus_.slope_y));
             widest_x = hn::Max(widest_x, hn::Abs(off_x));
             widest_y = hn::Max(widest_y, hn::Abs(off_y));
             hn::Store(sx, d, own_slope_x_ + lane);
             hn::Store(sy, d, own_slope_y_ + lane);
+            hn::Store(hn::MulAdd(hn::Max(hn::Abs(sx), hn::Abs(sy)), hn::Set(d, 0x1p-24F), hn::Set(d, 0x1p-88F)), d,
+                      slant_ + lane);
             hn::Store(off_x, d, off_x_ + lane);
             hn::Store(off_y, d, off_y_ + lane);
         }
-        spread_x_ = hn::GetLane(hn::MaxOfLanes(d, widest_x)) * (1 + 0x1p-20F) + 0x1p-22F;
-        spread_y_ = hn::GetLane(hn::MaxOfLanes(d, widest_y)) * (1 + 0x1p-20F) + 0x1p-22F;
-        if (spread_x_ > kWidest || spread_y_ > kWidest) {
+        focus_.spread_x = hn::GetLane(hn::MaxOfLanes(d, widest_x)) * (1 + 0x1p-20F) + 0x1p-22F;
+        focus_.spread_y = hn::GetLane(hn::MaxOfLanes(d, widest_y)) * (1 + 0x1p-20F) + 0x1p-22F;
+        if (focus_.spread_x > kWidest || focus_.spread_y > kWidest) {
             return false;
         }
-        x_ = static_cast<uint32_t>(kx) * kBlockSize;
-        y_ = static_cast<uint32_t>(ky) * kBlockSize;
-        z_ = static_cast<uint32_t>(kz) * kBlockSize;
-        focus_x_ = focus[kx];
-        focus_y_ = focus[ky];
-        focus_z_ = focus[kz];
-        deviation_ = deviation.x + deviation.y + deviation.z;
-        sign_ = towards[kz] < 0 ? -1.0F : 1.0F;
+        focus_.x = static_cast<uint32_t>(kx) * kBlockSize;
+        focus_.y = static_cast<uint32_t>(ky) * kBlockSize;
+        focus_.z = static_cast<uint32_t>(kz) * kBlockSize;
+        focus_.at_x = focus[kx];
+        focus_.at_y = focus[ky];
+        focus_.at_z = focus[kz];
+        focus_.set_errors(deviation.x + deviation.y + deviation.z);
+        focus_.sign = towards[kz] < 0 ? -1.0F : 1.0F;
         set_up_boxes(focus, deviation, towards, kz);
         set_up_intervals(kz, deviation[kz]);
         return true;
@@ -387,85 +391,10 @@ class Packet {
         return false;
     }
 
-    /// What a block's triangles look like from the focus, sheared so that the packet's middle runs along z.
-    struct View {
-        static constexpr size_t kSize = kBlocksPerStep * kBlockSize;
-        alignas(64) float normal[3][3][kSize];  ///< [edge][axis]: an edge function is n.z - off_y n.y - off_x n.x
-        alignas(64) float bound[kSize];         ///< no edge function is off by more
-        alignas(64) float z[3][kSize];          ///< the first corner's, and of the others what they lie behind it
-        alignas(64) float size[kSize];          ///< the largest |z|
-    };
-
-    /// Tests the triangles of a block that are not wholly outside the packet.
-    ///
-    /// With u = 2^-24, slopes that are off by at most 2 u, h = the sum of both spreads and g = h mz: to the error of an
-    /// edge function in the middle, u (12 mx my + 10 mz (mx + my)) + 50 u^2 mz^2 as in test_blocks, come what the
-    /// slopes' errors do, 4 u mz (mx + my); what those of n.x and n.y do, each below u (8 mz^2 + 14 mz m) for m = mx or
-    /// my, so together u g (8 mz + 14 m); and the roundings of the last products and sums, below u (4 mx my + 6 g m).
-    /// With s = mx + my + g + 5.5 u mz all that is below u s (9.1 s + 14.1 mz). Lines that miss the focus by up to
-    /// `deviation` change an edge function by no more than 2 deviation s, once the shear has added its z to its x and
-    /// y.
+    /// Tests the triangles of a block, or of two, that are not wholly beside the packet.
     HWY_INLINE void visit_blocks(uint32_t index, bool is_single) {
-        const hn::CappedTag<float, View::kSize> d8;
-        constexpr size_t kHere = hn::MaxLanes(hn::CappedTag<float, View::kSize>());
-        using V8 = hn::Vec<decltype(d8)>;
         View view;
-        uint32_t reached = 0;
-        const BlockLoader load(blocks_ + index, is_single);
-        for (size_t first = 0; first < View::kSize; first += kHere) {
-            V8 x[3];
-            V8 y[3];
-            V8 z[3];
-            for (size_t k = 0; k < 3; ++k) {
-                const size_t corner = k * 3 * kBlockSize + first;
-                z[k] = hn::Sub(load(corner + z_), hn::Set(d8, focus_z_));
-                x[k] = hn::NegMulAdd(hn::Set(d8, slope_x_), z[k], hn::Sub(load(corner + x_), hn::Set(d8, focus_x_)));
-                y[k] = hn::NegMulAdd(hn::Set(d8, slope_y_), z[k], hn::Sub(load(corner + y_), hn::Set(d8, focus_y_)));
-            }
-            const V8 mz = largest_of(z);
-            V8 bound = hn::Zero(d8);
-            if constexpr (kExact) {
-                const V8 s = hn::MulAdd(hn::Set(d8, spread_x_ + spread_y_ + 5.5F * 0x1p-24F), mz,
-                                        hn::Add(largest_of(x), largest_of(y)));
-                const V8 factor =
-                    hn::MulAdd(hn::Set(d8, 14.5F * 0x1p-24F), mz,
-                               hn::MulAdd(hn::Set(d8, 9.25F * 0x1p-24F), s, hn::Set(d8, 2.01F * deviation_)));
-                bound = hn::MulAdd(s, factor, hn::Set(d8, kTiny));
-            }
-            V8 most_inside = hn::Zero(d8);
-            V8 least_inside = hn::Zero(d8);
-            constexpr int kEdges[3][2] = {{2, 1}, {0, 2}, {1, 0}};
-            for (size_t e = 0; e < 3; ++e) {
-                const int a = kEdges[e][0];
-                const int b = kEdges[e][1];
-                const V8 nz = hn::MulSub(x[a], y[b], hn::Mul(y[a], x[b]));
-                const V8 ny = hn::MulSub(x[a], z[b], hn::Mul(z[a], x[b]));
-                const V8 nx = hn::MulSub(z[a], y[b], hn::Mul(y[a], z[b]));
-                const V8 range =
-                    hn::MulAdd(hn::Abs(nx), hn::Set(d8, spread_x_), hn::Mul(hn::Abs(ny), hn::Set(d8, spread_y_)));
-                const V8 high = hn::Add(nz, range);
-                const V8 low = hn::Sub(nz, range);
-                most_inside = e == 0 ? high : hn::Min(most_inside, high);
-                least_inside = e == 0 ? low : hn::Max(least_inside, low);
-                hn::Store(nx, d8, view.normal[e][0] + first);
-                hn::Store(ny, d8, view.normal[e][1] + first);
-                hn::Store(nz, d8, view.normal[e][2] + first);
-            }
-            const auto possible =
-                hn::Ge(hn::Max(most_inside, hn::Neg(least_inside)), hn::Neg(hn::Mul(bound, hn::Set(d8, 1 + 0x1p-10F))));
-            const V8 sign = hn::Set(d8, sign_);
-            const V8 depths[3] = {hn::Mul(z[0], sign), hn::Mul(z[1], sign), hn::Mul(z[2], sign)};
-            const V8 room = hn::MulAdd(mz, hn::Set(d8, 0x1p-20F), hn::Set(d8, kTiny));
-            const V8 nearest = hn::Sub(hn::Min(depths[0], hn::Min(depths[1], depths[2])), room);
-            const V8 farthest = hn::Add(hn::Max(depths[0], hn::Max(depths[1], depths[2])), room);
-            const auto in_range = hn::And(hn::Le(nearest, hn::Set(d8, reach_)), hn::Ge(farthest, hn::Set(d8, entry_)));
-            reached |= mask_bits(d8, hn::And(possible, in_range)) << first;
-            hn::Store(bound, d8, view.bound + first);
-            hn::Store(z[0], d8, view.z[0] + first);
-            hn::Store(hn::Sub(z[1], z[0]), d8, view.z[1] + first);
-            hn::Store(hn::Sub(z[2], z[0]), d8, view.z[2] + first);
-            hn::Store(mz, d8, view.size + first);
-        }
+        uint32_t reached = view.look(focus_, BlockLoader(blocks_ + index, is_single), entry_, reach_);
         if (is_single) {
             reached &= (1U << kBlockSize) - 1;
         }
@@ -487,13 +416,7 @@ class Packet {
     }
 
     HWY_INLINE void sides_from_focus(const View& view, uint32_t triangle, size_t lane, V (&side)[3]) const {
-        const V off_x = hn::Load(d, off_x_ + lane);
-        const V off_y = hn::Load(d, off_y_ + lane);
-        for (size_t e = 0; e < 3; ++e) {
-            side[e] = hn::NegMulAdd(
-                off_x, hn::Set(d, view.normal[e][0][triangle]),
-                hn::NegMulAdd(off_y, hn::Set(d, view.normal[e][1][triangle]), hn::Set(d, view.normal[e][2][triangle])));
-        }
+        view.sides(d, triangle, hn::Load(d, off_x_ + lane), hn::Load(d, off_y_ + lane), side);
     }
 
     HWY_INLINE hn::Mask<D> may_meet(const V (&side)[3], V bound, size_t lane) const {
@@ -514,15 +437,15 @@ class Packet {
     HWY_INLINE bool test_from_focus(const View& view, uint32_t triangle, uint32_t place) {
         bool taken = false;
         for (size_t lane = 0; lane < kRays; lane += kLanes) {
-            if (kAnyHit && is_reversed_) {
-                taken |= test_from_origins(lane, place);
-                continue;
-            }
             V side[3];
             sides_from_focus(view, triangle, lane, side);
             const V bound = hn::Set(d, view.bound[triangle]);
             const auto inside = may_meet(side, bound, lane);
             if (kLanes != kRays && hn::AllFalse(d, inside)) {
+                continue;
+            }
+            if (kAnyHit && is_reversed_) {
+                taken |= test_from_origins(lane, place);
                 continue;
             }
             // Where the view from the packet's middle is too coarse for one of the rays, their own are finer.
@@ -535,23 +458,17 @@ class Packet {
             }
             taken |= take(lane, side, depth_inside(side), inside, bound, hn::Set(d, view.size[triangle]),
                           hn::Set(d, view.z[0][triangle]), hn::Set(d, view.z[1][triangle]),
-                          hn::Set(d, view.z[2][triangle]), sign_, place);
+                          hn::Set(d, view.z[2][triangle]), focus_.sign, place);
         }
         return taken;
-    }
-
-    /// How far inside the least convincing of three edge functions lies.
-    static HWY_INLINE V depth_inside(const V (&side)[3]) {
-        return hn::Max(hn::Min(side[0], hn::Min(side[1], side[2])),
-                       hn::Neg(hn::Max(side[0], hn::Max(side[1], side[2]))));
     }
 
     /// One triangle against each ray from its own origin, as test_blocks has it.
     HWY_INLINE bool test_from_origins(size_t lane, uint32_t place) {
         const float* corners = blocks_[place / kBlockSize].vertex[0][0] + place % kBlockSize;
-        const V ox = hn::Load(d, origin_[x_ / kBlockSize] + lane);
-        const V oy = hn::Load(d, origin_[y_ / kBlockSize] + lane);
-        const V oz = hn::Load(d, origin_[z_ / kBlockSize] + lane);
+        const V ox = hn::Load(d, origin_[focus_.x / kBlockSize] + lane);
+        const V oy = hn::Load(d, origin_[focus_.y / kBlockSize] + lane);
+        const V oz = hn::Load(d, origin_[focus_.z / kBlockSize] + lane);
         const V sx = hn::Load(d, own_slope_x_ + lane);
         const V sy = hn::Load(d, own_slope_y_ + lane);
         V x[3];
@@ -559,19 +476,19 @@ class Packet {
         V z[3];
         for (size_t k = 0; k < 3; ++k) {
             const float* corner = corners + k * 3 * kBlockSize;
-            z[k] = hn::Sub(hn::Set(d, corner[z_]), oz);
-            x[k] = hn::NegMulAdd(sx, z[k], hn::Sub(hn::Set(d, corner[x_]), ox));
-            y[k] = hn::NegMulAdd(sy, z[k], hn::Sub(hn::Set(d, corner[y_]), oy));
+            z[k] = hn::Sub(hn::Set(d, corner[focus_.z]), oz);
+            x[k] = hn::NegMulAdd(sx, z[k], hn::Sub(hn::Set(d, corner[focus_.x]), ox));
+            y[k] = hn::NegMulAdd(sy, z[k], hn::Sub(hn::Set(d, corner[focus_.y]), oy));
         }
         const V side[3] = {hn::MulSub(x[2], y[1], hn::Mul(y[2], x[1])), hn::MulSub(x[0], y[2], hn::Mul(y[0], x[2])),
                            hn::MulSub(x[1], y[0], hn::Mul(y[1], x[0]))};
         V bound = hn::Zero(d);
         const V mz = largest_of(z);
         if constexpr (kExact) {
-            const V s = hn::MulAdd(hn::Set(d, 5.5F * 0x1p-24F), mz, hn::Add(largest_of(x), largest_of(y)));
-            bound =
-                hn::MulAdd(s, hn::MulAdd(hn::Set(d, 10.5F * 0x1p-24F), mz, hn::Mul(hn::Set(d, 3.25F * 0x1p-24F), s)),
-                           hn::Set(d, kTiny));
+            const V slant = hn::Mul(hn::Load(d, slant_ + lane), mz);
+            const V s = hn::MulAdd(hn::Set(d, 5.5F), slant, hn::Add(largest_of(x), largest_of(y)));
+            bound = hn::MulAdd(s, hn::MulAdd(hn::Set(d, 10.5F), slant, hn::Mul(hn::Set(d, 3.25F * 0x1p-24F), s)),
+                               hn::Set(d, kTiny));
         }
         const V inwards = depth_inside(side);
         const auto inside = hn::And(hn::Ge(inwards, hn::Neg(bound)), hn::Ge(hn::Load(d, reaches_ + lane), hn::Zero(d)));
@@ -579,7 +496,7 @@ class Packet {
             return false;
         }
         return take(lane, side, inwards, inside, bound, mz, z[0], hn::Sub(z[1], z[0]), hn::Sub(z[2], z[0]),
-                    is_reversed_ ? -sign_ : sign_, place);
+                    is_reversed_ ? -focus_.sign : focus_.sign, place);
     }
 
     /// Takes in a triangle for the rays that meet it, as Stream does. Depths are as test_blocks has them.
@@ -661,14 +578,11 @@ class Packet {
     uint32_t near_planes_[3], far_planes_[3];
     float bound_inverse_[3][2], bound_near_[3][2], bound_far_[3][2];  ///< of the least and the most steep ray
     float entry_, reach_;                                             ///< no box counts outside these depths
-    uint32_t x_, y_, z_;                                              ///< as in TracedRay
-    float focus_x_, focus_y_, focus_z_;
-    float slope_x_, slope_y_, spread_x_, spread_y_;  ///< of the middle, and by how much rays differ from it
-    float sign_, deviation_;
+    Focus focus_;
     alignas(64) float direction_[3][kRays];  ///< seen from the focus
     alignas(64) float origin_[3][kRays];
     alignas(64) float inverse_[3][kRays], near_shift_[3][kRays], far_shift_[3][kRays];
-    alignas(64) float own_slope_x_[kRays], own_slope_y_[kRays], off_x_[kRays], off_y_[kRays];
+    alignas(64) float own_slope_x_[kRays], own_slope_y_[kRays], slant_[kRays], off_x_[kRays], off_y_[kRays];
     alignas(64) float start_[kRays], reaches_[kRays], sure_start_[kRays], sure_end_[kRays], lower_[kRays];
     alignas(64) float box_start_[kRays], box_reach_[kRays];
     alignas(64) uint32_t place_[kRays], triangle_[kRays];

@@ -77,6 +77,21 @@ HWY_INLINE size_t compress_pair(D d, hn::Mask<D> mask, hn::Vec<hn::RebindToUnsig
 #endif
 }
 
+/// The axes in such an order that z has a direction's largest component; found without branches, which rays in all
+/// directions would make the processor guess wrong.
+struct Axes {
+    uint32_t x, y, z;
+
+    HWY_INLINE explicit Axes(Vec3f direction) {
+        constexpr uint32_t kAfter[4] = {1, 2, 0, 1};
+        const Vec3f size{std::abs(direction.x), std::abs(direction.y), std::abs(direction.z)};
+        z = std::max(size.x, size.y) > size.z ? (size.x > size.y ? 0U : 1U) : 2U;
+        x = kAfter[z];
+        y = kAfter[z + 1];
+    }
+    HWY_INLINE uint32_t operator[](size_t axis) const { return axis == 0 ? x : axis == 1 ? y : z; }
+};
+
 /// The largest coordinate of the tree, of either sign.
 inline float extent_of(const Tree& tree) {
     float extent = 0;
@@ -104,6 +119,7 @@ struct alignas(64) TracedRay {
     uint32_t x, y, z;  ///< from a corner's first float to its coordinates on that axis
     float ox, oy, oz;  ///< the origin, permuted
     float sx, sy;
+    float slant;       ///< how much a corner's z, rounded, moves its x and y
     float sign;        ///< of the direction along z
     float sure_start;  ///< a depth not below this lies beyond t_min for certain
     float sure_end;    ///< nor one above this beyond t_max
@@ -126,13 +142,9 @@ struct alignas(64) TracedRay {
         const hn::RebindToUnsigned<decltype(d)> du;
         const auto origin = hn::LoadU(d, &given.origin.x);        // and t_min
         const auto direction = hn::LoadU(d, &given.direction.x);  // and t_max
-        const Vec3f size{std::abs(given.direction.x), std::abs(given.direction.y), std::abs(given.direction.z)};
-        const float larger = std::max(size.x, size.y);
-        const float largest = std::max(larger, size.z);
-        const uint32_t kz = larger > size.z ? (size.x > size.y ? 0U : 1U) : 2U;
-        constexpr uint32_t kAfter[4] = {1, 2, 0, 1};
-        const uint32_t kx = kAfter[kz];
-        const uint32_t ky = kAfter[kz + 1];
+        const Axes axes(given.direction);
+        const float largest =
+            std::max({std::abs(given.direction.x), std::abs(given.direction.y), std::abs(given.direction.z)});
 
         const auto negative = hn::Lt(direction, hn::Zero(d));
         octant = mask_bits(d, negative) & 7U;
@@ -160,19 +172,20 @@ struct alignas(64) TracedRay {
         start = given.t_min * largest * (1 - 0x1p-21F) - kTiny;
         sure_start = given.t_min * largest * (1 + 0x1p-21F) + kTiny;
         sure_end = given.t_max * largest * (1 - 0x1p-21F) - kTiny;
-        x = kx * kBlockSize;
-        y = ky * kBlockSize;
-        z = kz * kBlockSize;
+        x = axes.x * kBlockSize;
+        y = axes.y * kBlockSize;
+        z = axes.z * kBlockSize;
         alignas(16) float o[4];
         alignas(16) float along[4];
         hn::Store(origin, d, o);
         hn::Store(direction, d, along);
-        ox = o[kx];
-        oy = o[ky];
-        oz = o[kz];
-        sx = along[kx] / along[kz];
-        sy = along[ky] / along[kz];
-        sign = std::copysign(1.0F, along[kz]);
+        ox = o[axes.x];
+        oy = o[axes.y];
+        oz = o[axes.z];
+        sx = along[axes.x] / along[axes.z];
+        sy = along[axes.y] / along[axes.z];
+        slant = 0x1p-24F * (std::max(std::abs(sx), std::abs(sy)) + 0x1p-64F);
+        sign = std::copysign(1.0F, along[axes.z]);
         place = kNoPlace;
         shorten(0, given.t_max * largest);
         lower = kInfinity;

@@ -33,16 +33,38 @@ struct Verdict {
     uint32_t certain;  ///< lanes that the line meets, by whatever depth
 };
 
-/// The larger of the sizes of three numbers.
+#if HWY_TARGET <= HWY_AVX3
+/// By one operation for two numbers: 0xa for the smaller of their sizes, 0xb for the larger.
+template <int kWhich>
+HWY_INLINE __m512 range_of(__m512 a, __m512 b) {
+    return _mm512_range_ps(a, b, kWhich);
+}
+template <int kWhich>
+HWY_INLINE __m512d range_of(__m512d a, __m512d b) {
+    return _mm512_range_pd(a, b, kWhich);
+}
+#endif
+
+/// The largest of the sizes of three numbers.
 template <class V>
 HWY_INLINE V largest_of(const V (&c)[3]) {
 #if HWY_TARGET <= HWY_AVX3
-    if constexpr (sizeof(V) == 64) {  // one operation each instead of two
-        const auto one = _mm512_range_ps(c[0].raw, c[1].raw, 0xb);
-        return V{_mm512_range_ps(one, c[2].raw, 0xb)};
+    if constexpr (sizeof(V) == 64) {
+        return V{range_of<0xb>(range_of<0xb>(c[0].raw, c[1].raw), c[2].raw)};
     }
 #endif
     return hn::Max(hn::Max(hn::Abs(c[0]), hn::Abs(c[1])), hn::Abs(c[2]));
+}
+
+/// The smallest of them.
+template <class V>
+HWY_INLINE V smallest_of(const V (&c)[3]) {
+#if HWY_TARGET <= HWY_AVX3
+    if constexpr (sizeof(V) == 64) {
+        return V{range_of<0xa>(range_of<0xa>(c[0].raw, c[1].raw), c[2].raw)};
+    }
+#endif
+    return hn::Min(hn::Min(hn::Abs(c[0]), hn::Abs(c[1])), hn::Abs(c[2]));
 }
 
 /// Reads blocks lane by lane, those of a second block behind the first's; a single block stands for both.
@@ -90,9 +112,9 @@ struct Sheared {
 
 /// Less than minus the error of any of the three edge functions; mz: the largest |z| of the corners. EXACTNESS.md, 8.
 template <class D, class V = hn::Vec<D>>
-HWY_INLINE V minus_edge_error(D d, const Sheared<V>& seen, V mz) {
-    const V s = hn::MulAdd(hn::Set(d, 5.5F * 0x1p-24F), mz, hn::Add(largest_of(seen.x), largest_of(seen.y)));
-    return hn::MulAdd(s, hn::MulAdd(hn::Set(d, -10.5F * 0x1p-24F), mz, hn::Mul(hn::Set(d, -3.25F * 0x1p-24F), s)),
+HWY_INLINE V minus_edge_error(D d, const TracedRay& ray, const Sheared<V>& seen, V mz) {
+    const V s = hn::MulAdd(hn::Set(d, 5.5F * ray.slant), mz, hn::Add(largest_of(seen.x), largest_of(seen.y)));
+    return hn::MulAdd(s, hn::MulAdd(hn::Set(d, -10.5F * ray.slant), mz, hn::Mul(hn::Set(d, -3.25F * 0x1p-24F), s)),
                       hn::Set(d, -kTiny));
 }
 
@@ -131,7 +153,7 @@ HWY_INLINE uint32_t test_blocks(const TracedRay& ray, const TriangleBlock* block
         V mz = below;
         if constexpr (kExact) {
             mz = largest_of(z);
-            below = minus_edge_error(d, seen, mz);
+            below = minus_edge_error(d, ray, seen, mz);
         }
         const auto inside = hn::Ge(inwards, below);
         if (hn::AllFalse(d, inside)) {

@@ -14,6 +14,7 @@
 #include <hwy/highway.h>
 
 #include "kdtree/finish-inl.h"
+#include "kdtree/focus_view-inl.h"
 #include "kdtree/triangle_test-inl.h"
 
 #ifndef ESPALIER_TEST_TRACE_BOUNDS_TYPES
@@ -30,6 +31,17 @@ struct FilterResult {
     float u, v, w, bound;
     bool possible, certain;
     float lower, upper;
+};
+/// What one ray of a packet sees of a triangle.
+struct SeenFromFocus {
+    Vec3f focus;
+    float deviation;  ///< by how much the ray misses it, summed over the axes
+    float slope[2];   ///< of the packet's middle
+    float spread;     ///< of the packet along both axes, if the ray's slopes do not differ by more
+};
+struct ViewResult {
+    bool reached;
+    float side[3], bound;
 };
 struct FinishResult {
     bool open;
@@ -65,7 +77,7 @@ inline DepthsResult depths_of(const Ray& ray, float extent, const Box3f& box) {
     return result;
 }
 
-inline FilterResult filter(const Ray& ray, const Vec3f (&corner)[3]) {
+inline TriangleBlock block_of(const Vec3f (&corner)[3]) {
     TriangleBlock block;
     for (uint32_t lane = 0; lane < kBlockSize; ++lane) {
         block.triangle[lane] = lane;
@@ -75,12 +87,17 @@ inline FilterResult filter(const Ray& ray, const Vec3f (&corner)[3]) {
             }
         }
     }
+    return block;
+}
+
+inline FilterResult filter(const Ray& ray, const Vec3f (&corner)[3]) {
+    const TriangleBlock block = block_of(corner);
     TracedRay traced;
     traced.start_from(ray, kMaxCoordinate);
     const hn::CappedTag<float, kBlockSize> d;
     using V = hn::Vec<decltype(d)>;
     const Sheared<V> seen(d, traced, [&](size_t k, uint32_t axis) { return hn::Load(d, block.vertex[k][0] + axis); });
-    const V bound = hn::Neg(minus_edge_error(d, seen, largest_of(seen.z)));
+    const V bound = hn::Neg(minus_edge_error(d, traced, seen, largest_of(seen.z)));
     Verdict verdict{};
     const uint32_t possible = test_blocks<true>(traced, &block, true, verdict);
     return {hn::GetLane(seen.u), hn::GetLane(seen.v),  hn::GetLane(seen.w),
@@ -88,19 +105,45 @@ inline FilterResult filter(const Ray& ray, const Vec3f (&corner)[3]) {
             verdict.lower[0],    verdict.upper[0]};
 }
 
+/// As Packet sets it up, for a packet of this ray and others.
+inline ViewResult look(const Ray& ray, const Vec3f (&corner)[3], const SeenFromFocus& seen) {
+    const TriangleBlock block = block_of(corner);
+    const Axes axes(ray.direction);
+    const float* along = &ray.direction.x;
+    const float off[2] = {along[axes.x] / along[axes.z] - seen.slope[0], along[axes.y] / along[axes.z] - seen.slope[1]};
+    const auto spread = [&](float own) { return std::max(std::abs(own), seen.spread) * (1 + 0x1p-20F) + 0x1p-22F; };
+    const float* at = &seen.focus.x;
+    Focus focus{axes.x * kBlockSize,
+                axes.y * kBlockSize,
+                axes.z * kBlockSize,
+                at[axes.x],
+                at[axes.y],
+                at[axes.z],
+                seen.slope[0],
+                seen.slope[1],
+                spread(off[0]),
+                spread(off[1]),
+                0,
+                0,
+                0};
+    // Seen from where it ends, a ray runs the other way.
+    focus.sign = std::copysign(1.0F, along[axes.z]) * (seen.deviation > 0 ? -1.0F : 1.0F);
+    focus.set_errors(seen.deviation);
+    FocusView<true> view;
+    const uint32_t reached = view.look(focus, BlockLoader(&block, true), -seen.deviation, kInfinity);
+    const hn::CappedTag<float, 4> d;
+    hn::Vec<decltype(d)> side[3];
+    view.sides(d, 0, hn::Set(d, off[0]), hn::Set(d, off[1]), side);
+    return {(reached & 1U) != 0, {hn::GetLane(side[0]), hn::GetLane(side[1]), hn::GetLane(side[2])}, view.bound[0]};
+}
+
 inline FinishResult finish(const Ray& ray, const Vec3f (&corner)[3]) {
+    const TriangleBlock block = block_of(corner);
     FinishBatch batch;
-    for (size_t lane = 0; lane < FinishBatch::kSize; ++lane) {
-        for (int axis = 0; axis < 3; ++axis) {
-            const auto a = static_cast<size_t>(axis);
-            batch.origin[a][lane] = ray.origin[axis];
-            batch.direction[a][lane] = ray.direction[axis];
-            for (size_t k = 0; k < 3; ++k) {
-                batch.corner[k][a][lane] = corner[k][axis];
-            }
-        }
+    for (uint32_t lane = 0; lane < FinishBatch::kSize; ++lane) {
+        batch.put(lane, ray, &block, lane);
     }
-    const bool open = (finish_in_double(batch) & 1U) != 0;
+    const bool open = (espalier::HWY_NAMESPACE::finish<double>(batch) & 1U) != 0;
     return {open, batch.t[0], batch.u[0], batch.v[0]};
 }
 
@@ -115,13 +158,14 @@ struct Code {
     const char* name;
     DepthsResult (*depths_of)(const Ray&, float, const Box3f&);
     FilterResult (*filter)(const Ray&, const Vec3f (&)[3]);
+    ViewResult (*look)(const Ray&, const Vec3f (&)[3], const SeenFromFocus&);
     FinishResult (*finish)(const Ray&, const Vec3f (&)[3]);
 };
 
 std::vector<Code> code_under_test() {
-#define ESPALIER_CODE(name, set)                       \
-    {                                                  \
-        name, set::depths_of, set::filter, set::finish \
+#define ESPALIER_CODE(name, set)                                  \
+    {                                                             \
+        name, set::depths_of, set::filter, set::look, set::finish \
     }
     return runnable<Code>({
 #if defined(__x86_64__)
@@ -155,6 +199,7 @@ Aimed aim(Random& random, int low, int high) {
         corner = base + offset * std::ldexp(1.0F, -shrink);
     }
     aimed.ray.origin = random.point(low, high);
+    const bool is_steep = random.below(4) == 0;
     double weight[3] = {random.fraction(), random.fraction(), random.below(2) == 0 ? 0.0 : random.fraction()};
     const double sum = weight[0] + weight[1] + weight[2] + 0x1p-60;
     const uint32_t first = random.below(3);
@@ -166,6 +211,12 @@ Aimed aim(Random& random, int low, int high) {
         aimed.ray.origin = to_float(target);
         aimed.ray.direction = random.point(-3, 0);
     } else {
+        if (is_steep) {  // nearly along an axis
+            const double most =
+                std::ldexp(length(target - to_double(aimed.ray.origin)), -static_cast<int>(random.below(40)));
+            aimed.ray.origin.y = static_cast<float>(target.y + most * random.fraction());
+            aimed.ray.origin.z = static_cast<float>(target.z - most * random.fraction());
+        }
         const Vec3d d = target - to_double(aimed.ray.origin);
         const double largest = std::max({std::abs(d.x), std::abs(d.y), std::abs(d.z)});
         const double scale = largest > 0 ? std::ldexp(1.0, -std::ilogb(largest)) : 0;
@@ -321,6 +372,65 @@ TEST_P(TraceBounds, OfTheFloatFilterHoldWhatItDoesNotDecide) {
     EXPECT_GT(edges.largest(), 0.1);
     EXPECT_LT(depths.largest(), 1);
     EXPECT_GT(depths.largest(), 0.03);
+}
+
+TEST_P(TraceBounds, OfTheViewFromAFocusHoldForEveryRay) {
+    Random random(10);
+    Share edges(named("edge functions from a focus, 8"));
+    uint32_t lost = 0;
+    uint32_t undecided = 0;
+    uint32_t beside = 0;
+    uint32_t hits = 0;
+    for (const auto& [low, high] : kRanges) {
+        for (int i = 0; i < 5000; ++i) {
+            const Aimed aimed = aim(random, low, high);
+            if (!has_area(aimed.corner)) {
+                continue;
+            }
+            Ray ray = aimed.ray;
+            SeenFromFocus seen{ray.origin, 0, {0, 0}, 0};
+            const bool ends_together = random.below(2) == 0;
+            if (ends_together) {
+                ray.direction = ray.direction * -std::ldexp(1.0F, high);
+                ray.origin = seen.focus - ray.direction;
+                ray.t_max = 1;
+                const Vec3f end = ray.origin + ray.direction;
+                for (int axis = 0; axis < 3; ++axis) {
+                    seen.deviation += std::abs(end[axis] - seen.focus[axis]) * (1 + 0x1p-20F) +
+                                      std::abs(end[axis]) * 0x1p-23F + 0x1p-120F;
+                }
+            }
+            const int kz = largest_axis(ray.direction);
+            if (std::abs(ray.direction[kz]) < 0x1p-100F || seen.deviation > kMaxCoordinate) {
+                continue;
+            }
+            const Exact along = ray.direction[kz];
+            seen.spread = std::ldexp(1.0F, -3 - static_cast<int>(random.below(20)));
+            for (int k = 0; k < 2; ++k) {
+                const float own = ray.direction[(kz + 1 + k) % 3] / ray.direction[kz];
+                seen.slope[k] =
+                    std::clamp(own + static_cast<float>(4 * random.fraction() - 2) * seen.spread, -1.0F, 1.0F);
+            }
+            const ViewResult result = GetParam().look(ray, aimed.corner, seen);
+            const ExactTriangle truth(ray, aimed.corner);
+            for (int k = 0; k < 3; ++k) {
+                edges.add(result.side[k] + truth.weight[k] / along, result.bound);
+            }
+            const bool is_hit = truth.is_hit() && truth.t() >= 0 && (!ends_together || truth.t() <= 1);
+            hits += is_hit ? 1U : 0U;
+            lost += is_hit && !result.reached ? 1U : 0U;
+            beside += result.reached ? 0U : 1U;
+            const float least = std::max(std::min({result.side[0], result.side[1], result.side[2]}),
+                                         -std::max({result.side[0], result.side[1], result.side[2]}));
+            undecided += std::abs(least) <= result.bound ? 1U : 0U;
+        }
+    }
+    EXPECT_EQ(lost, 0U);
+    EXPECT_GT(hits, 3000U);
+    EXPECT_GT(beside, 100U);
+    EXPECT_GT(undecided, 1000U);
+    EXPECT_LT(edges.largest(), 1);
+    EXPECT_GT(edges.largest(), 0.1);
 }
 
 TEST_P(TraceBounds, OfTheFinishAreKept) {
