@@ -21,7 +21,7 @@ Case = tuple[Floats, Ints, Floats, Floats]
 MakeCase = Callable[[Generator, int], Case]
 
 
-PACKET = 32  # as many as any instruction set takes as one packet
+PACKET = 32  # as many as the tracer takes as one packet
 
 
 def make(name: str, rays: int, seed: int = 0) -> Case:

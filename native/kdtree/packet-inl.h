@@ -30,7 +30,8 @@ namespace hn = hwy::HWY_NAMESPACE;
 template <bool kAnyHit, bool kExact>
 class Packet {
  public:
-    static constexpr size_t kRays = 2 * hn::MaxLanes(hn::CappedTag<float, 16>());
+    /// Fewer share too little of their way; more lose where triangles are as small as pixels (OPTIMIZATION.md).
+    static constexpr size_t kRays = 32;
 
     explicit Packet(const Tree& tree)
         : nodes_(tree.wide_nodes.data()),
@@ -104,24 +105,34 @@ class Packet {
     /// Directions that differ by more are no packet.
     static constexpr float kWidest = 0.125F;
 
-    HWY_INLINE V field(size_t lane, size_t offset) const {
-        const hn::RebindToSigned<D> di;
-        const auto index = hn::Mul(hn::Iota(di, static_cast<int32_t>(lane)), hn::Set(di, sizeof(Ray) / sizeof(float)));
-        return hn::GatherIndex(d, reinterpret_cast<const float*>(rays_) + offset, index);
+    /// Lays the rays out component by component.
+    HWY_INLINE void unpack() {
+        static_assert(sizeof(Ray) == 8 * sizeof(float));
+        for (size_t lane = 0; lane < kRays; lane += kLanes) {
+            // A ray is a pair of quadruples: origins get into even lanes, directions into odd ones.
+            const float* from = &rays_[lane].origin.x;
+            V low[4];
+            V high[4];
+            hn::LoadInterleaved4(d, from, low[0], low[1], low[2], low[3]);
+            hn::LoadInterleaved4(d, from + 4 * kLanes, high[0], high[1], high[2], high[3]);
+            for (size_t axis = 0; axis < 3; ++axis) {
+                hn::Store(hn::ConcatEven(d, high[axis], low[axis]), d, origin_[axis] + lane);
+                hn::Store(hn::ConcatOdd(d, high[axis], low[axis]), d, direction_[axis] + lane);
+            }
+            hn::Store(hn::ConcatEven(d, high[3], low[3]), d, t_min_ + lane);
+            hn::Store(hn::ConcatOdd(d, high[3], low[3]), d, t_max_ + lane);
+        }
     }
 
     /// Rays that start in one point.
     HWY_INLINE bool from_focus(Vec3f focus) {
-        for (size_t lane = 0; lane < kRays; lane += kLanes) {
-            auto same = hn::Eq(field(lane, 0), hn::Set(d, focus.x));
-            same = hn::And(same, hn::Eq(field(lane, 1), hn::Set(d, focus.y)));
-            same = hn::And(same, hn::Eq(field(lane, 2), hn::Set(d, focus.z)));
-            if (!hn::AllTrue(d, same)) {
-                return false;
-            }
-            for (size_t axis = 0; axis < 3; ++axis) {
-                hn::Store(field(lane, 4 + axis), d, direction_[axis] + lane);
-                hn::Store(hn::Set(d, focus[static_cast<int>(axis)]), d, origin_[axis] + lane);
+        unpack();
+        for (size_t axis = 0; axis < 3; ++axis) {
+            const V here = hn::Set(d, focus[static_cast<int>(axis)]);
+            for (size_t lane = 0; lane < kRays; lane += kLanes) {
+                if (!hn::AllTrue(d, hn::Eq(hn::Load(d, origin_[axis] + lane), here))) {
+                    return false;
+                }
             }
         }
         is_reversed_ = false;
@@ -130,12 +141,13 @@ class Packet {
 
     /// Rays that end, at t = 1, in one point up to rounding, and not behind it.
     HWY_INLINE bool to_focus(Vec3f focus) {
+        unpack();
         Vec3f deviation;
         for (size_t axis = 0; axis < 3; ++axis) {
             V largest = hn::Zero(d);
             for (size_t lane = 0; lane < kRays; lane += kLanes) {
-                const V origin = field(lane, axis);
-                const V way = field(lane, 4 + axis);
+                const V origin = hn::Load(d, origin_[axis] + lane);
+                const V way = hn::Load(d, direction_[axis] + lane);
                 const V end = hn::Add(origin, way);
                 // The sum and the difference are off by u of their results.
                 const V off = hn::MulAdd(hn::Abs(end), hn::Set(d, 0x1p-23F),
@@ -143,12 +155,11 @@ class Packet {
                                                  hn::Set(d, 1 + 0x1p-20F)));
                 largest = hn::Max(largest, off);
                 hn::Store(hn::Neg(way), d, direction_[axis] + lane);
-                hn::Store(origin, d, origin_[axis] + lane);
             }
             deviation[static_cast<int>(axis)] = hn::GetLane(hn::MaxOfLanes(d, largest)) + kTiny;
         }
         for (size_t lane = 0; lane < kRays; lane += kLanes) {
-            if (!hn::AllTrue(d, hn::Le(field(lane, 7), hn::Set(d, 1.0F)))) {
+            if (!hn::AllTrue(d, hn::Le(hn::Load(d, t_max_ + lane), hn::Set(d, 1.0F)))) {
                 return false;
             }
         }
@@ -240,7 +251,7 @@ class Packet {
                 const V largest = hn::Abs(hn::Load(d, direction_[kz] + lane));
                 const V own =
                     hn::Max(hn::Abs(hn::Load(d, direction_[axis] + lane)), hn::Mul(largest, hn::Set(d, 0x1p-25F)));
-                const V steepness = hn::Div(largest, own);
+                const V steepness = axis == kz ? hn::Set(d, 1.0F) : hn::Div(largest, own);
                 least = hn::Min(least, steepness);
                 most = hn::Max(most, steepness);
                 V near, far;
@@ -264,8 +275,8 @@ class Packet {
         V least = hn::Set(d, kInfinity);
         for (size_t lane = 0; lane < kRays; lane += kLanes) {
             const V size = hn::Abs(hn::Load(d, direction_[kz] + lane));
-            const V t_min = field(lane, 3);
-            const V t_max = field(lane, 7);
+            const V t_min = hn::Load(d, t_min_ + lane);
+            const V t_max = hn::Load(d, t_max_ + lane);
             const V tiny = hn::Set(d, kTiny);
             const V below = hn::Set(d, 1 - 0x1p-21F);
             const V above = hn::Set(d, 1 + 0x1p-21F);
@@ -580,7 +591,7 @@ class Packet {
     float entry_, reach_;                                             ///< no box counts outside these depths
     Focus focus_;
     alignas(64) float direction_[3][kRays];  ///< seen from the focus
-    alignas(64) float origin_[3][kRays];
+    alignas(64) float origin_[3][kRays], t_min_[kRays], t_max_[kRays];
     alignas(64) float inverse_[3][kRays], near_shift_[3][kRays], far_shift_[3][kRays];
     alignas(64) float own_slope_x_[kRays], own_slope_y_[kRays], slant_[kRays], off_x_[kRays], off_y_[kRays];
     alignas(64) float start_[kRays], reaches_[kRays], sure_start_[kRays], sure_end_[kRays], lower_[kRays];
