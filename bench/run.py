@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Measures builds and rays beside Embree on the meshes that are there: python -m bench.run [--help]
 
-Writes build/bench/bench.json and bench.md, or large or scaling in place of bench, and prints the latter.
+Writes build/bench/bench.json and bench.md, or large, hostile or scaling in place of bench, and prints the latter.
 build/bench/espalier_scaling and a .mesh file from there are all that another machine needs: it prints the JSON whose
 place is report["meshes"][name][simd].
 """
@@ -34,6 +34,8 @@ SHARED = ROOT.parent / "shared/meshes"
 MESHES = ("sponza", "bunny", "armadillo", "dragon")  # .npz files
 SCENES = ("sculpture",)  # shipped ones, exported as the world's triangles
 INTERIORS = {"sponza"}  # looked at from within
+HOSTILE = ("long", "copies", "coplanar", "furball")  # made by hostile_mesh
+HOSTILE_TRIANGLES = (200_000, 2_000_000)
 PARTS = ("memory", "quality", "builds", "rays", "preview")
 ONCE = {"memory", "quality"}  # parts that are the same for every instruction set
 QUIET_LOAD = 0.3
@@ -86,6 +88,35 @@ def world_mesh(arrays: SceneArrays) -> tuple[Points, Triangles, Points]:
     slope = 1 / arrays.camera.projection[0, 0]
     view = np.array([*eye, *(eye - back), *up, *(eye + 4 * up - 4 * right), slope], np.float32)
     return np.concatenate(vertices).astype(np.float32), np.concatenate(triangles).astype(np.uint32), view
+
+
+def hostile_mesh(kind: str, count: int) -> tuple[Points, Triangles, Points]:
+    """Triangles that planes hardly part: long ones in a cube, copies of one, many in one plane, or slivers of fur"""
+    rng = np.random.default_rng(1)
+    corners = rng.random((count, 3, 3))
+    if kind == "long":
+        sides = rng.integers(3, size=(count, 3, 1))
+        np.put_along_axis(corners, sides, rng.integers(2, size=(count, 3, 1)).astype(float), 2)
+    elif kind == "copies":
+        corners[:] = [[0, 0, 0], [1, 0, 0.5], [0, 1, 0]]
+    elif kind == "coplanar":
+        corners = corners[:, :1] + 0.01 * corners
+        corners[:, :, 2] = 0.25
+    else:
+        root = rng.standard_normal((count, 1, 3))
+        root /= np.linalg.norm(root, axis=2, keepdims=True)
+        tip = root * (1 + rng.random((count, 1, 1))) + 0.1 * rng.random((count, 1, 3))
+        corners = np.concatenate([root, tip, root + np.array([1e-4, 1e-4, 0])], axis=1)
+    vertices = corners.reshape(-1, 3).astype(np.float32)
+    return vertices, np.arange(3 * count, dtype=np.uint32).reshape(-1, 3), view_of(vertices, inside=False)
+
+
+def prepare_hostile(name: str) -> Path:
+    """The file of a hostile mesh, whose name ends in its number of triangles"""
+    kind, count = name.split("_")
+    path = BUILD / f"{name}.mesh"
+    write_mesh(path, *hostile_mesh(kind, int(count)))
+    return path
 
 
 def write_mesh(path: Path, vertices: Points, triangles: Triangles, view: Points) -> None:
@@ -148,7 +179,7 @@ def compare(options: argparse.Namespace) -> dict[str, Any]:
     program = BUILD / ("espalier_scaling" if options.scaling else "espalier_bench")
     simds = options.simd.split(",") if options.simd else run(BUILD / "espalier_bench")
     for name in options.meshes.split(","):
-        path = prepare(name)
+        path = prepare_hostile(name) if options.hostile else prepare(name)
         if path is None:
             continue
         report["meshes"][name] = {}
@@ -178,14 +209,19 @@ def main() -> None:
         metavar="COPIES",
         help="instead: builds of %(const)s copies, by default of sculpture",
     )
+    hostile = [f"{kind}_{count}" for kind in HOSTILE for count in HOSTILE_TRIANGLES]
+    parser.add_argument("--hostile", action="store_true", help=f"instead: builds of {', '.join(hostile)}")
     parser.add_argument("--scaling", action="store_true", help="instead: 1, 2, 4 ... threads, without Embree")
     options = parser.parse_args()
     if options.large:
         options.parts, options.meshes = f"copies={options.large}", options.meshes or "sculpture"
+    if options.hostile:
+        options.parts, options.meshes = "quality,builds", options.meshes or ",".join(hostile)
     options.meshes = options.meshes or ("sponza,bunny" if options.quick else everything)
     BUILD.mkdir(parents=True, exist_ok=True)
     report = compare(options)
-    name = "large" if options.large else "scaling" if options.scaling else "bench"
+    kinds = {"large": options.large, "hostile": options.hostile, "scaling": options.scaling}
+    name = next((kind for kind, is_asked in kinds.items() if is_asked), "bench")
     (BUILD / f"{name}.json").write_text(json.dumps(report), encoding="utf-8")
     (BUILD / f"{name}.md").write_text(markdown(report), encoding="utf-8")
     print(markdown(report))
