@@ -52,8 +52,8 @@ struct alignas(64) FinishBatch {
 ///
 /// Sheared as in the float filter, but in double, and times the direction's z, which saves a division. With e = 2^-53
 /// and m = mz |direction z|, an edge function is then off by less than e s (4.25 s + 8.5 m) = bound (EXACTNESS.md, 12).
-/// Where each outweighs that, all have their true signs. Errors of the weights move the depth by less than 3.25 bound /
-/// |det| times what the corners lie apart, at most 2 mz, and other roundings by 2^-49 mz. Float, for the path that does
+/// Errors of the weights move the depth by less than 3.25 bound / |det| times what the corners lie apart, at most 2 mz,
+/// and other roundings by 2^-49 mz. Float, for the path that does
 /// without exactness, is taken as it comes.
 template <class T>
 HWY_INLINE uint32_t finish(FinishBatch& batch) {
@@ -131,14 +131,13 @@ HWY_INLINE uint32_t finish(FinishBatch& batch) {
             // The depth's error against 2^-28 of it, both times |det|.
             const V error =
                 hn::Mul(mz, hn::Add(hn::Mul(bound, hn::Set(d, 6.5)), hn::Mul(hn::Abs(det), hn::Set(d, 0x1p-49))));
-            const auto t_sure = hn::And(hn::Le(error, hn::Mul(hn::Abs(depth_sum), hn::Set(d, 0x1p-28))),
-                                        hn::Le(hn::Abs(t), hn::Set(d, double{std::numeric_limits<float>::max()})));
-            const auto sure = hn::And(t_sure, hn::Gt(smallest_of(side), bound));
+            const auto sure = hn::And(hn::Le(error, hn::Mul(hn::Abs(depth_sum), hn::Set(d, 0x1p-28))),
+                                      hn::Le(hn::Abs(t), hn::Set(d, double{std::numeric_limits<float>::max()})));
             open |= (~mask_bits(d, sure) & ((1U << kLanes) - 1)) << first;
         }
         store(t, batch.t);
-        store(hn::Mul(side[1], per_det), batch.u);
-        store(hn::Mul(side[2], per_det), batch.v);
+        store(hn::Max(hn::Mul(side[1], per_det), hn::Zero(d)), batch.u);
+        store(hn::Max(hn::Mul(side[2], per_det), hn::Zero(d)), batch.v);
     }
     return open;
 }

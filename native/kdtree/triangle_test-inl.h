@@ -34,15 +34,9 @@ struct Verdict {
 };
 
 #if HWY_TARGET <= HWY_AVX3
-/// By one operation for two numbers: 0xa for the smaller of their sizes, 0xb for the larger.
-template <int kWhich>
-HWY_INLINE __m512 range_of(__m512 a, __m512 b) {
-    return _mm512_range_ps(a, b, kWhich);
-}
-template <int kWhich>
-HWY_INLINE __m512d range_of(__m512d a, __m512d b) {
-    return _mm512_range_pd(a, b, kWhich);
-}
+/// The larger of the sizes of two numbers by one operation.
+HWY_INLINE __m512 larger_of(__m512 a, __m512 b) { return _mm512_range_ps(a, b, 0xb); }
+HWY_INLINE __m512d larger_of(__m512d a, __m512d b) { return _mm512_range_pd(a, b, 0xb); }
 #endif
 
 /// The largest of the sizes of three numbers.
@@ -50,21 +44,10 @@ template <class V>
 HWY_INLINE V largest_of(const V (&c)[3]) {
 #if HWY_TARGET <= HWY_AVX3
     if constexpr (sizeof(V) == 64) {
-        return V{range_of<0xb>(range_of<0xb>(c[0].raw, c[1].raw), c[2].raw)};
+        return V{larger_of(larger_of(c[0].raw, c[1].raw), c[2].raw)};
     }
 #endif
     return hn::Max(hn::Max(hn::Abs(c[0]), hn::Abs(c[1])), hn::Abs(c[2]));
-}
-
-/// The smallest of them.
-template <class V>
-HWY_INLINE V smallest_of(const V (&c)[3]) {
-#if HWY_TARGET <= HWY_AVX3
-    if constexpr (sizeof(V) == 64) {
-        return V{range_of<0xa>(range_of<0xa>(c[0].raw, c[1].raw), c[2].raw)};
-    }
-#endif
-    return hn::Min(hn::Min(hn::Abs(c[0]), hn::Abs(c[1])), hn::Abs(c[2]));
 }
 
 /// Reads blocks lane by lane, those of a second block behind the first's; a single block stands for both.
