@@ -53,8 +53,7 @@ struct alignas(64) FinishBatch {
 /// Sheared as in the float filter, but in double, and times the direction's z, which saves a division. With e = 2^-53
 /// and m = mz |direction z|, an edge function is then off by less than e s (4.25 s + 8.5 m) = bound (EXACTNESS.md, 12).
 /// Errors of the weights move the depth by less than 3.25 bound / |det| times what the corners lie apart, at most 2 mz,
-/// and other roundings by 2^-49 mz. Float, for the path that does
-/// without exactness, is taken as it comes.
+/// and other roundings by 2^-49 mz. Float, for the path that does without exactness, is taken as it comes.
 template <class T>
 HWY_INLINE uint32_t finish(FinishBatch& batch) {
     constexpr bool kExact = sizeof(T) == sizeof(double);
