@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// The distance and the place of known hits, eight rays at a time in double. Compiled once per instruction set (see
+// The distance and the place of known hits, sixteen rays at a time in double. Compiled once per instruction set (see
 // traversal.cpp).
 
 #if defined(ESPALIER_KDTREE_FINISH_INL_H_) == defined(HWY_TARGET_TOGGLE)
@@ -130,8 +130,11 @@ HWY_INLINE uint32_t finish(FinishBatch& batch) {
             // The depth's error against 2^-28 of it, both times |det|.
             const V error =
                 hn::Mul(mz, hn::Add(hn::Mul(bound, hn::Set(d, 6.5)), hn::Mul(hn::Abs(det), hn::Set(d, 0x1p-49))));
-            const auto sure = hn::And(hn::Le(error, hn::Mul(hn::Abs(depth_sum), hn::Set(d, 0x1p-28))),
-                                      hn::Le(hn::Abs(t), hn::Set(d, double{std::numeric_limits<float>::max()})));
+            const auto t_sure = hn::And(hn::Le(error, hn::Mul(hn::Abs(depth_sum), hn::Set(d, 0x1p-28))),
+                                        hn::Le(hn::Abs(t), hn::Set(d, double{std::numeric_limits<float>::max()})));
+            // Follows from that, unless all corners lie at depth 0.
+            const auto place_sure = hn::Le(bound, hn::Mul(hn::Abs(det), hn::Set(d, 0x1p-30)));
+            const auto sure = hn::And(t_sure, place_sure);
             open |= (~mask_bits(d, sure) & ((1U << kLanes) - 1)) << first;
         }
         store(t, batch.t);

@@ -76,11 +76,10 @@ struct FocusView {
     /// them.
     ///
     /// Edges are differences of corners as they are given, so that errors count by the edge and not by what lies
-    /// between it and the packet's middle. With u = 2^-24, E the sum of the edges' largest sizes along x, y and z, m =
-    /// mx
-    /// + my, and slope and g = (spread_x + spread_y) mz, an edge function is off by at most u E (13.5 m + 4 slope mz +
-    /// 11 g), and by 1.25 deviation E for lines that miss the focus; a corner's distance from a bounding plane by no
-    /// more than that less E. EXACTNESS.md, 8.
+    /// between it and the packet's middle. With u = 2^-24, E the sum of the edges' largest sizes along x, y and z,
+    /// m = mx + my, and g = (spread_x + spread_y) mz, an edge function is off by at most u E (13.6 m + 4 slope mz + 11
+    /// g), and by 1.25 deviation E for lines that miss the focus; a corner's distance from a bounding plane by no more
+    /// than that less E. Subnormal edges, whose errors are not so small, count as 2^-120. EXACTNESS.md, 8.
     HWY_INLINE uint32_t look(const Focus& focus, const BlockLoader& load, float entry, float reach) {
         const hn::CappedTag<float, kSize> d;
         constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<float, kSize>());
@@ -111,7 +110,8 @@ struct FocusView {
             V margin = hn::Zero(d);
             if constexpr (kExact) {
                 const V m = hn::Add(largest_of(x), largest_of(y));
-                const V edge = hn::Add(hn::Add(largest_of(edge_x), largest_of(edge_y)), largest_of(edge_z));
+                const V edge = hn::Add(hn::Add(largest_of(edge_x), largest_of(edge_y)),
+                                       hn::Add(largest_of(edge_z), hn::Set(d, kTiny)));
                 margin = hn::MulAdd(hn::Set(d, focus.along_error), mz,
                                     hn::MulAdd(hn::Set(d, 14 * 0x1p-24F), m, hn::Set(d, focus.miss)));
                 bound_here = hn::MulAdd(edge, margin, hn::Set(d, kTiny));

@@ -110,7 +110,7 @@ class Packet {
         static_assert(sizeof(Ray) == 8 * sizeof(float));
         for (size_t lane = 0; lane < kRays; lane += kLanes) {
             // A ray is a pair of quadruples: origins get into even lanes, directions into odd ones.
-            const float* from = &rays_[lane].origin.x;
+            const auto* from = reinterpret_cast<const float*>(rays_ + lane);
             V low[4];
             V high[4];
             hn::LoadInterleaved4(d, from, low[0], low[1], low[2], low[3]);

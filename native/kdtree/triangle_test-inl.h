@@ -104,13 +104,13 @@ HWY_INLINE V minus_edge_error(D d, const TracedRay& ray, const Sheared<V>& seen,
 /// The lanes of a block, and of the one behind it where a step takes two, that the ray may hit within [start, reach];
 /// every lane that it does hit is among them.
 ///
-/// With u = 2^-24 and mx, my, mz the largest |x|, |y| and |z| of the corners seen from the origin: a sheared coordinate
-/// is off by at most u (2 mx + 5 mz), since the shear carries one rounding, z one, their product and the difference one
-/// each and x one. An edge function, a difference of two products of such, is then off by at most u (12 mx my + 10 mz
-/// (mx + my)) + 50 u^2 mz^2. With s = mx + my + 5.5 u mz, and mx my <= (mx + my)^2 / 4, that is less than u s (3.1 s +
-/// 10.1 mz), and `bound` lies above by more than the roundings of its own sum. Fused operations only leave roundings
-/// out. Underflow adds less than kTiny: a product's is below 2^-149, and a coordinate's counts by at most 2^-149 s,
-/// which u s^2 outweighs from s = 2^-125 on.
+/// With u = 2^-24, mx, my, mz the largest |x|, |y| and |z| of the corners seen from the origin, and n what the shear
+/// makes of mz: a sheared coordinate is off by at most u (2 mx + 5 n), since the shear carries one rounding, z one,
+/// their product and the difference one each and x one. An edge function, a difference of two products of such, is then
+/// off by at most u (12 mx my + 10 n (mx + my)) + 50 u^2 n^2. With s = mx + my + 5.5 u n, and mx my <= (mx + my)^2 / 4,
+/// that is less than u s (3.1 s + 10.1 n), and `bound` lies above by more than the roundings of its own sum. Fused
+/// operations only leave roundings out. Underflow adds less than kTiny: a product's is below 2^-149, and a coordinate's
+/// counts by at most 2^-149 s, which u s^2 outweighs from s = 2^-125 on.
 ///
 /// The depth is z0 + (v (z1 - z0) + w (z2 - z0)) / det for weights u, v, w and their sum det. Where |det| >= 32 bound,
 /// the true weights of a lane that is not ruled out are at most 1.2 of det in size; with r the larger of |z1 - z0| and

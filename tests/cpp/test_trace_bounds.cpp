@@ -109,16 +109,17 @@ inline FilterResult filter(const Ray& ray, const Vec3f (&corner)[3]) {
 inline ViewResult look(const Ray& ray, const Vec3f (&corner)[3], const SeenFromFocus& seen) {
     const TriangleBlock block = block_of(corner);
     const Axes axes(ray.direction);
-    const float* along = &ray.direction.x;
-    const float off[2] = {along[axes.x] / along[axes.z] - seen.slope[0], along[axes.y] / along[axes.z] - seen.slope[1]};
+    const auto part = [](Vec3f v, uint32_t axis) { return v[static_cast<int>(axis)]; };
+    const float along = part(ray.direction, axes.z);
+    const float off[2] = {part(ray.direction, axes.x) / along - seen.slope[0],
+                          part(ray.direction, axes.y) / along - seen.slope[1]};
     const auto spread = [&](float own) { return std::max(std::abs(own), seen.spread) * (1 + 0x1p-20F) + 0x1p-22F; };
-    const float* at = &seen.focus.x;
     Focus focus{axes.x * kBlockSize,
                 axes.y * kBlockSize,
                 axes.z * kBlockSize,
-                at[axes.x],
-                at[axes.y],
-                at[axes.z],
+                part(seen.focus, axes.x),
+                part(seen.focus, axes.y),
+                part(seen.focus, axes.z),
                 seen.slope[0],
                 seen.slope[1],
                 spread(off[0]),
@@ -127,7 +128,7 @@ inline ViewResult look(const Ray& ray, const Vec3f (&corner)[3], const SeenFromF
                 0,
                 0};
     // Seen from where it ends, a ray runs the other way.
-    focus.sign = std::copysign(1.0F, along[axes.z]) * (seen.deviation > 0 ? -1.0F : 1.0F);
+    focus.sign = std::copysign(1.0F, along) * (seen.deviation > 0 ? -1.0F : 1.0F);
     focus.set_errors(seen.deviation);
     FocusView<true> view;
     const uint32_t reached = view.look(focus, BlockLoader(&block, true), -seen.deviation, kInfinity);
@@ -408,8 +409,7 @@ TEST_P(TraceBounds, OfTheViewFromAFocusHoldForEveryRay) {
             seen.spread = std::ldexp(1.0F, -3 - static_cast<int>(random.below(20)));
             for (int k = 0; k < 2; ++k) {
                 const float own = ray.direction[(kz + 1 + k) % 3] / ray.direction[kz];
-                seen.slope[k] =
-                    std::clamp(own + static_cast<float>(4 * random.fraction() - 2) * seen.spread, -1.0F, 1.0F);
+                seen.slope[k] = std::clamp(own + (4 * random.fraction() - 2) * seen.spread, -1.0F, 1.0F);
             }
             const ViewResult result = GetParam().look(ray, aimed.corner, seen);
             const ExactTriangle truth(ray, aimed.corner);
@@ -431,6 +431,44 @@ TEST_P(TraceBounds, OfTheViewFromAFocusHoldForEveryRay) {
     EXPECT_GT(undecided, 1000U);
     EXPECT_LT(edges.largest(), 1);
     EXPECT_GT(edges.largest(), 0.1);
+}
+
+TEST_P(TraceBounds, OfTheViewFromAFocusHoldForSubnormalTriangles) {
+    Random random(11);
+    Share edges(named("the same, subnormal triangles, 8"));
+    for (int i = 0; i < 20000; ++i) {
+        Vec3f corner[3];
+        for (Vec3f& at : corner) {
+            const auto few = [&] { return (static_cast<float>(random.below(9)) - 4) * 0x1p-149F; };
+            at = {few(), few(), few()};
+        }
+        if (!has_area(corner)) {
+            continue;
+        }
+        const Vec3f far_point{0.5F - random.fraction(), 0.5F - random.fraction(), -1};
+        const Ray ray{far_point * 0x1p54F, 0, {0.3F * random.fraction(), 0.3F * random.fraction(), 1}, HUGE_VALF};
+        const float slope = 0.3F * random.fraction();
+        const SeenFromFocus seen{ray.origin, 0, {slope, slope}, 0.125F};
+        const ViewResult result = GetParam().look(ray, corner, seen);
+        const ExactTriangle truth(ray, corner);
+        for (int k = 0; k < 3; ++k) {
+            edges.add(result.side[k] + truth.weight[k] / Exact(ray.direction.z), result.bound);
+        }
+    }
+    EXPECT_LT(edges.largest(), 1);
+}
+
+TEST_P(TraceBounds, OfTheFinishHoldInAFaceThroughTheOrigin) {
+    const Ray ray{{0, 0, 0}, 0, {0.1F, 0.3F, 1.9858157634735107F}, HUGE_VALF};
+    const Vec3f sliver[3] = {{7788337, 8081358, 0}, {2045900, 2122873, 0}, {-9834237, -10204231, 0}};
+    EXPECT_TRUE(GetParam().finish(ray, sliver).open) << "double has too few digits for u and v";
+    const Vec3f plain[3] = {{4, 1, 0}, {-3, 2, 0}, {-1, -3, 0}};
+    const FinishResult result = GetParam().finish(ray, plain);
+    const ExactTriangle truth(ray, plain);
+    EXPECT_FALSE(result.open);
+    EXPECT_EQ(result.t, 0);
+    EXPECT_NEAR(result.u, Exact(truth.weight[1] / truth.below).get_d(), std::exp2(-22.6));
+    EXPECT_NEAR(result.v, Exact(truth.weight[2] / truth.below).get_d(), std::exp2(-22.6));
 }
 
 TEST_P(TraceBounds, OfTheFinishAreKept) {
