@@ -142,7 +142,7 @@ inline FinishResult finish(const Ray& ray, const Vec3f (&corner)[3]) {
     const TriangleBlock block = block_of(corner);
     FinishBatch batch;
     for (uint32_t lane = 0; lane < FinishBatch::kSize; ++lane) {
-        batch.put(lane, ray, &block, lane);
+        batch.put(lane, ray, &block, lane % kBlockSize);
     }
     const bool open = (espalier::HWY_NAMESPACE::finish<double>(batch) & 1U) != 0;
     return {open, batch.t[0], batch.u[0], batch.v[0]};
