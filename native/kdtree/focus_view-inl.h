@@ -41,12 +41,6 @@ struct Focus {
     }
 };
 
-/// How far inside the least convincing of three edge functions lies.
-template <class V>
-HWY_INLINE V depth_inside(const V (&side)[3]) {
-    return hn::Max(hn::Min(side[0], hn::Min(side[1], side[2])), hn::Neg(hn::Max(side[0], hn::Max(side[1], side[2]))));
-}
-
 /// How far three corners lie together beyond one of the two planes that bound the rays along an axis.
 template <class V>
 HWY_INLINE V distance_beside(const V (&x)[3], const V (&depth)[3], float spread) {

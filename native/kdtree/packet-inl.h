@@ -169,10 +169,10 @@ class Packet {
 
     HWY_INLINE bool set_up(Vec3f focus, Vec3f deviation) {
         const Vec3f towards{direction_[0][0], direction_[1][0], direction_[2][0]};
-        const Vec3f size{std::abs(towards.x), std::abs(towards.y), std::abs(towards.z)};
-        const int kz = size.x > size.y ? (size.x > size.z ? 0 : 2) : (size.y > size.z ? 1 : 2);
-        const int kx = kz == 2 ? 0 : kz + 1;
-        const int ky = kx == 2 ? 0 : kx + 1;
+        const Axes axes(towards);
+        const auto kx = static_cast<int>(axes.x);
+        const auto ky = static_cast<int>(axes.y);
+        const auto kz = static_cast<int>(axes.z);
         const Vec3f far_end{direction_[0][kRays - 1], direction_[1][kRays - 1], direction_[2][kRays - 1]};
         focus_.slope_x = 0.5F * (towards[kx] / towards[kz] + far_end[kx] / far_end[kz]);
         focus_.slope_y = 0.5F * (towards[ky] / towards[kz] + far_end[ky] / far_end[kz]);
@@ -207,9 +207,9 @@ class Packet {
         if (focus_.spread_x > kWidest || focus_.spread_y > kWidest) {
             return false;
         }
-        focus_.x = static_cast<uint32_t>(kx) * kBlockSize;
-        focus_.y = static_cast<uint32_t>(ky) * kBlockSize;
-        focus_.z = static_cast<uint32_t>(kz) * kBlockSize;
+        focus_.x = axes.x * kBlockSize;
+        focus_.y = axes.y * kBlockSize;
+        focus_.z = axes.z * kBlockSize;
         focus_.at_x = focus[kx];
         focus_.at_y = focus[ky];
         focus_.at_z = focus[kz];
@@ -477,36 +477,26 @@ class Packet {
     /// One triangle against each ray from its own origin, as test_blocks has it.
     HWY_INLINE bool test_from_origins(size_t lane, uint32_t place) {
         const float* corners = blocks_[place / kBlockSize].vertex[0][0] + place % kBlockSize;
-        const V ox = hn::Load(d, origin_[focus_.x / kBlockSize] + lane);
-        const V oy = hn::Load(d, origin_[focus_.y / kBlockSize] + lane);
-        const V oz = hn::Load(d, origin_[focus_.z / kBlockSize] + lane);
-        const V sx = hn::Load(d, own_slope_x_ + lane);
-        const V sy = hn::Load(d, own_slope_y_ + lane);
-        V x[3];
-        V y[3];
-        V z[3];
-        for (size_t k = 0; k < 3; ++k) {
-            const float* corner = corners + k * 3 * kBlockSize;
-            z[k] = hn::Sub(hn::Set(d, corner[focus_.z]), oz);
-            x[k] = hn::NegMulAdd(sx, z[k], hn::Sub(hn::Set(d, corner[focus_.x]), ox));
-            y[k] = hn::NegMulAdd(sy, z[k], hn::Sub(hn::Set(d, corner[focus_.y]), oy));
-        }
-        const V side[3] = {hn::MulSub(x[2], y[1], hn::Mul(y[2], x[1])), hn::MulSub(x[0], y[2], hn::Mul(y[0], x[2])),
-                           hn::MulSub(x[1], y[0], hn::Mul(y[1], x[0]))};
-        V bound = hn::Zero(d);
-        const V mz = largest_of(z);
-        if constexpr (kExact) {
-            const V slant = hn::Mul(hn::Load(d, slant_ + lane), mz);
-            const V s = hn::MulAdd(hn::Set(d, 5.5F), slant, hn::Add(largest_of(x), largest_of(y)));
-            bound = hn::MulAdd(s, hn::MulAdd(hn::Set(d, 10.5F), slant, hn::Mul(hn::Set(d, 3.25F * 0x1p-24F), s)),
-                               hn::Set(d, kTiny));
-        }
-        const V inwards = depth_inside(side);
+        const ShearedRay<V> own{focus_.x,
+                                focus_.y,
+                                focus_.z,
+                                hn::Load(d, origin_[focus_.x / kBlockSize] + lane),
+                                hn::Load(d, origin_[focus_.y / kBlockSize] + lane),
+                                hn::Load(d, origin_[focus_.z / kBlockSize] + lane),
+                                hn::Load(d, own_slope_x_ + lane),
+                                hn::Load(d, own_slope_y_ + lane),
+                                hn::Load(d, slant_ + lane)};
+        const Sheared<V> seen(own,
+                              [&](size_t k, uint32_t axis) { return hn::Set(d, corners[k * 3 * kBlockSize + axis]); });
+        const V mz = largest_of(seen.z);
+        const V bound = kExact ? seen.edge_error(own.slant, mz) : hn::Zero(d);
+        const V inwards = depth_inside(seen.side);
         const auto inside = hn::And(hn::Ge(inwards, hn::Neg(bound)), hn::Ge(hn::Load(d, reaches_ + lane), hn::Zero(d)));
         if (hn::AllFalse(d, inside)) {
             return false;
         }
-        return take(lane, side, inwards, inside, bound, mz, z[0], hn::Sub(z[1], z[0]), hn::Sub(z[2], z[0]),
+        const V(&z)[3] = seen.z;
+        return take(lane, seen.side, inwards, inside, bound, mz, z[0], hn::Sub(z[1], z[0]), hn::Sub(z[2], z[0]),
                     is_reversed_ ? -focus_.sign : focus_.sign, place);
     }
 
@@ -515,22 +505,10 @@ class Packet {
                          V r2, float sign, uint32_t place) {
         const uint32_t triangle = triangle_at(blocks_, place);
         const V reach = hn::Load(d, reaches_ + lane);
-        const V det = hn::Add(side[0], hn::Add(side[1], side[2]));
-        const V inverse = hn::Div(hn::Set(d, 1), det);
-        const V depth = hn::Mul(
-            hn::MulAdd(hn::Mul(side[1], inverse), r1, hn::MulAdd(hn::Mul(side[2], inverse), r2, z0)), hn::Set(d, sign));
-        V lower = depth;
-        V upper = depth;
-        auto certain = inside;
-        if constexpr (kExact) {
-            const V doubt =
-                hn::Mul(hn::Mul(hn::Mul(hn::Set(d, 8.5F), bound), hn::Abs(inverse)), hn::Max(hn::Abs(r1), hn::Abs(r2)));
-            const V error = hn::MulAdd(hn::Set(d, 0x1p-19F), mz, hn::Add(doubt, hn::Set(d, kTiny)));
-            const auto is_sound = hn::Ge(hn::Abs(det), hn::Max(hn::Mul(hn::Set(d, 32), bound), hn::Set(d, 0x1p-120F)));
-            lower = hn::IfThenElse(is_sound, hn::Sub(depth, error), hn::Set(d, -kInfinity));
-            upper = hn::IfThenElse(is_sound, hn::Add(depth, error), hn::Set(d, kInfinity));
-            certain = hn::And(is_sound, hn::Gt(inwards, bound));
-        }
+        const DepthRange<V> depth = depth_range<kExact>(side, bound, mz, z0, r1, r2, sign);
+        const V lower = depth.lower;
+        const V upper = depth.upper;
+        const auto certain = kExact ? hn::And(depth.is_sound, hn::Gt(inwards, bound)) : inside;
         const auto is_new = hn::Ne(hn::BitCast(du, hn::Load(du, triangle_ + lane)), hn::Set(du, triangle));
         const auto counts = hn::And(hn::And(inside, hn::RebindMask(d, is_new)),
                                     hn::And(hn::Le(lower, reach), hn::Ge(upper, hn::Load(d, start_ + lane))));

@@ -89,7 +89,6 @@ struct Axes {
         x = kAfter[z];
         y = kAfter[z + 1];
     }
-    HWY_INLINE uint32_t operator[](size_t axis) const { return axis == 0 ? x : axis == 1 ? y : z; }
 };
 
 /// The largest coordinate of the tree, of either sign.

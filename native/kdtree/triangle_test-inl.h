@@ -71,34 +71,84 @@ class BlockLoader {
     [[maybe_unused]] const float* second_;
 };
 
-/// Triangles as the ray sees them, along +z through the origin, and their edge functions: the weights of the corners.
+/// One ray for all lanes, or one for each.
+template <class V>
+struct ShearedRay {
+    uint32_t x, y, z;  ///< as in TracedRay, and so are the others
+    V ox, oy, oz;
+    V sx, sy;
+    V slant;
+};
+
+/// Triangles as a ray sees them, along +z through the origin, and their edge functions: the weights of the corners.
 template <class V>
 struct Sheared {
     V x[3];
     V y[3];
     V z[3];
-    V u, v, w;
+    V side[3];
 
     /// load(k, axis): the coordinates of corner k, `axis` as in TracedRay.
-    template <class D, class Load>
-    HWY_INLINE Sheared(D d, const TracedRay& ray, const Load& load) {
+    template <class Load>
+    HWY_INLINE Sheared(const ShearedRay<V>& ray, const Load& load) {
         for (size_t k = 0; k < 3; ++k) {
-            z[k] = hn::Sub(load(k, ray.z), hn::Set(d, ray.oz));
-            x[k] = hn::NegMulAdd(hn::Set(d, ray.sx), z[k], hn::Sub(load(k, ray.x), hn::Set(d, ray.ox)));
-            y[k] = hn::NegMulAdd(hn::Set(d, ray.sy), z[k], hn::Sub(load(k, ray.y), hn::Set(d, ray.oy)));
+            z[k] = hn::Sub(load(k, ray.z), ray.oz);
+            x[k] = hn::NegMulAdd(ray.sx, z[k], hn::Sub(load(k, ray.x), ray.ox));
+            y[k] = hn::NegMulAdd(ray.sy, z[k], hn::Sub(load(k, ray.y), ray.oy));
         }
-        u = hn::MulSub(x[2], y[1], hn::Mul(y[2], x[1]));
-        v = hn::MulSub(x[0], y[2], hn::Mul(y[0], x[2]));
-        w = hn::MulSub(x[1], y[0], hn::Mul(y[1], x[0]));
+        side[0] = hn::MulSub(x[2], y[1], hn::Mul(y[2], x[1]));
+        side[1] = hn::MulSub(x[0], y[2], hn::Mul(y[0], x[2]));
+        side[2] = hn::MulSub(x[1], y[0], hn::Mul(y[1], x[0]));
+    }
+
+    /// More than the error of any of the three edge functions; mz: the largest |z| of the corners. EXACTNESS.md, 8.
+    HWY_INLINE V edge_error(V slant, V mz) const {
+        const hn::DFromV<V> d;
+        const V s = hn::MulAdd(hn::Mul(hn::Set(d, 5.5F), slant), mz, hn::Add(largest_of(x), largest_of(y)));
+        const V slope = hn::MulAdd(hn::Mul(hn::Set(d, 10.5F), slant), mz, hn::Mul(hn::Set(d, 3.25F * 0x1p-24F), s));
+        return hn::MulAdd(s, slope, hn::Set(d, kTiny));
     }
 };
 
-/// Less than minus the error of any of the three edge functions; mz: the largest |z| of the corners. EXACTNESS.md, 8.
-template <class D, class V = hn::Vec<D>>
-HWY_INLINE V minus_edge_error(D d, const TracedRay& ray, const Sheared<V>& seen, V mz) {
-    const V s = hn::MulAdd(hn::Set(d, 5.5F * ray.slant), mz, hn::Add(largest_of(seen.x), largest_of(seen.y)));
-    return hn::MulAdd(s, hn::MulAdd(hn::Set(d, -10.5F * ray.slant), mz, hn::Mul(hn::Set(d, -3.25F * 0x1p-24F), s)),
-                      hn::Set(d, -kTiny));
+/// How far inside the least convincing of three edge functions lies.
+template <class V>
+HWY_INLINE V depth_inside(const V (&side)[3]) {
+    return hn::Max(hn::Min(side[0], hn::Min(side[1], side[2])), hn::Neg(hn::Max(side[0], hn::Max(side[1], side[2]))));
+}
+
+/// Between which depths the lines meet triangles' planes.
+template <class V>
+struct DepthRange {
+    V lower;
+    V upper;
+    hn::Mask<hn::DFromV<V>> is_sound;  ///< both are finite
+};
+
+/// Of hits inside triangles whose edge functions are off by at most `bound`, whose first corners lie at z0 and the
+/// others r1 and r2 behind it, mz the largest |z|; sign: of the direction along z.
+///
+/// The depth is z0 + (v (z1 - z0) + w (z2 - z0)) / det for weights u, v, w and their sum det. Where |det| >= 32 bound,
+/// the true weights of a lane that is not ruled out are at most 1.2 of det in size; with r the larger of |z1 - z0| and
+/// |z2 - z0|, errors of v and w move the depth by 2 bound r / |det|, those of det, at most 4 bound with its own
+/// roundings, by 4 * 1.3 bound r / |det|, and the difference between det and its true value makes that 8.3 at most. The
+/// z are off by u mz each and the other operations by less than 24 u mz together: 2^-19 mz covers them.
+template <bool kExact, class V>
+HWY_INLINE DepthRange<V> depth_range(const V (&side)[3], V bound, V mz, V z0, V r1, V r2, float sign) {
+    const hn::DFromV<V> d;
+    const V det = hn::Add(side[0], hn::Add(side[1], side[2]));
+    const V inverse = hn::Div(hn::Set(d, 1), det);
+    const V depth = hn::Mul(hn::MulAdd(hn::Mul(side[1], inverse), r1, hn::MulAdd(hn::Mul(side[2], inverse), r2, z0)),
+                            hn::Set(d, sign));
+    if constexpr (!kExact) {
+        return {depth, depth, hn::Eq(depth, depth)};
+    }
+    const V doubt =
+        hn::Mul(hn::Mul(hn::Mul(hn::Set(d, 8.5F), bound), hn::Abs(inverse)), hn::Max(hn::Abs(r1), hn::Abs(r2)));
+    const V error = hn::MulAdd(hn::Set(d, 0x1p-19F), mz, hn::Add(doubt, hn::Set(d, kTiny)));
+    // So small a det may have no reciprocal.
+    const auto is_sound = hn::Ge(hn::Abs(det), hn::Max(hn::Mul(hn::Set(d, 32), bound), hn::Set(d, 0x1p-120F)));
+    return {hn::IfThenElse(is_sound, hn::Sub(depth, error), hn::Set(d, -kInfinity)),
+            hn::IfThenElse(is_sound, hn::Add(depth, error), hn::Set(d, kInfinity)), is_sound};
 }
 
 /// The lanes of a block, and of the one behind it where a step takes two, that the ray may hit within [start, reach];
@@ -111,67 +161,50 @@ HWY_INLINE V minus_edge_error(D d, const TracedRay& ray, const Sheared<V>& seen,
 /// that is less than u s (3.1 s + 10.1 n), and `bound` lies above by more than the roundings of its own sum. Fused
 /// operations only leave roundings out. Underflow adds less than kTiny: a product's is below 2^-149, and a coordinate's
 /// counts by at most 2^-149 s, which u s^2 outweighs from s = 2^-125 on.
-///
-/// The depth is z0 + (v (z1 - z0) + w (z2 - z0)) / det for weights u, v, w and their sum det. Where |det| >= 32 bound,
-/// the true weights of a lane that is not ruled out are at most 1.2 of det in size; with r the larger of |z1 - z0| and
-/// |z2 - z0|, errors of v and w move the depth by 2 bound r / |det|, those of det, at most 4 bound with its own
-/// roundings, by 4 * 1.3 bound r / |det|, and the difference between det and its true value makes that 8.3 at most. The
-/// z are off by u mz each and the other operations by less than 24 u mz together: 2^-19 mz covers them.
 template <bool kExact>
 HWY_INLINE uint32_t test_blocks(const TracedRay& ray, const TriangleBlock* block, bool is_single, Verdict& verdict) {
     const hn::CappedTag<float, kBlocksPerStep * kBlockSize> d;
     constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<float, kBlocksPerStep * kBlockSize>());
     using V = hn::Vec<decltype(d)>;
     const BlockLoader load(block, is_single);
+    const ShearedRay<V> sheared{ray.x,
+                                ray.y,
+                                ray.z,
+                                hn::Set(d, ray.ox),
+                                hn::Set(d, ray.oy),
+                                hn::Set(d, ray.oz),
+                                hn::Set(d, ray.sx),
+                                hn::Set(d, ray.sy),
+                                hn::Set(d, ray.slant)};
     uint32_t possible = 0;
     for (size_t first = 0; first < kBlockSize; first += kLanes) {
-        const Sheared<V> seen(d, ray, [&](size_t k, uint32_t axis) { return load(k * 3 * kBlockSize + first + axis); });
-        const V u = seen.u;
-        const V v = seen.v;
-        const V w = seen.w;
-        const V(&z)[3] = seen.z;
-        // How far the least convincing of the three lies inside. Lanes without a triangle are NaN and fail.
-        const V inwards = hn::Max(hn::Min(u, hn::Min(v, w)), hn::Neg(hn::Max(u, hn::Max(v, w))));
-        V below = hn::Zero(d);  // -bound
-        V mz = below;
+        const Sheared<V> seen(sheared,
+                              [&](size_t k, uint32_t axis) { return load(k * 3 * kBlockSize + first + axis); });
+        const V inwards = depth_inside(seen.side);  // lanes without a triangle are NaN and fail
+        V bound = hn::Zero(d);
+        V mz = bound;
         if constexpr (kExact) {
-            mz = largest_of(z);
-            below = minus_edge_error(d, ray, seen, mz);
+            mz = largest_of(seen.z);
+            bound = seen.edge_error(sheared.slant, mz);
         }
-        const auto inside = hn::Ge(inwards, below);
+        const auto inside = hn::Ge(inwards, hn::Neg(bound));
         if (hn::AllFalse(d, inside)) {
             continue;
         }
-        const V det = hn::Add(u, hn::Add(v, w));
-        const V inverse = hn::Div(hn::Set(d, 1), det);
-        const V r1 = hn::Sub(z[1], z[0]);
-        const V r2 = hn::Sub(z[2], z[0]);
-        const V depth = hn::Mul(hn::MulAdd(hn::Mul(v, inverse), r1, hn::MulAdd(hn::Mul(w, inverse), r2, z[0])),
-                                hn::Set(d, ray.sign));
-        V lower = depth;
-        V upper = depth;
-        auto certain = inside;
-        if constexpr (kExact) {
-            const V bound = hn::Neg(below);
-            const V doubt =
-                hn::Mul(hn::Mul(hn::Mul(hn::Set(d, 8.5F), bound), hn::Abs(inverse)), hn::Max(hn::Abs(r1), hn::Abs(r2)));
-            const V error = hn::MulAdd(hn::Set(d, 0x1p-19F), mz, hn::Add(doubt, hn::Set(d, kTiny)));
-            // So small a det may have no reciprocal.
-            const auto is_sound = hn::Ge(hn::Abs(det), hn::Max(hn::Mul(hn::Set(d, 32), bound), hn::Set(d, 0x1p-120F)));
-            lower = hn::IfThenElse(is_sound, hn::Sub(depth, error), hn::Set(d, -kInfinity));
-            upper = hn::IfThenElse(is_sound, hn::Add(depth, error), hn::Set(d, kInfinity));
-            certain = hn::And(is_sound, hn::Gt(inwards, bound));
-        }
-        const auto counts =
-            hn::And(inside, hn::And(hn::Le(lower, hn::Set(d, ray.reach)), hn::Ge(upper, hn::Set(d, ray.start))));
+        const V(&z)[3] = seen.z;
+        const DepthRange<V> depth =
+            depth_range<kExact>(seen.side, bound, mz, z[0], hn::Sub(z[1], z[0]), hn::Sub(z[2], z[0]), ray.sign);
+        const auto certain = kExact ? hn::And(depth.is_sound, hn::Gt(inwards, bound)) : inside;
+        const auto counts = hn::And(
+            inside, hn::And(hn::Le(depth.lower, hn::Set(d, ray.reach)), hn::Ge(depth.upper, hn::Set(d, ray.start))));
         if (hn::AllFalse(d, counts)) {
             continue;
         }
         if (possible == 0) {
             verdict.certain = 0;
         }
-        hn::Store(lower, d, verdict.lower + first);
-        hn::Store(upper, d, verdict.upper + first);
+        hn::Store(depth.lower, d, verdict.lower + first);
+        hn::Store(depth.upper, d, verdict.upper + first);
         possible |= mask_bits(d, counts) << first;
         verdict.certain |= mask_bits(d, certain) << first;
     }

@@ -28,7 +28,7 @@ struct DepthsResult {
     float entry, exit;                  ///< of the box
 };
 struct FilterResult {
-    float u, v, w, bound;
+    float side[3], bound;
     bool possible, certain;
     float lower, upper;
 };
@@ -40,7 +40,7 @@ struct SeenFromFocus {
     float spread;     ///< of the packet along both axes, if the ray's slopes do not differ by more
 };
 struct ViewResult {
-    bool reached;
+    bool reached, open;
     float side[3], bound;
 };
 struct FinishResult {
@@ -96,13 +96,25 @@ inline FilterResult filter(const Ray& ray, const Vec3f (&corner)[3]) {
     traced.start_from(ray, kMaxCoordinate);
     const hn::CappedTag<float, kBlockSize> d;
     using V = hn::Vec<decltype(d)>;
-    const Sheared<V> seen(d, traced, [&](size_t k, uint32_t axis) { return hn::Load(d, block.vertex[k][0] + axis); });
-    const V bound = hn::Neg(minus_edge_error(d, traced, seen, largest_of(seen.z)));
+    const ShearedRay<V> own{traced.x,
+                            traced.y,
+                            traced.z,
+                            hn::Set(d, traced.ox),
+                            hn::Set(d, traced.oy),
+                            hn::Set(d, traced.oz),
+                            hn::Set(d, traced.sx),
+                            hn::Set(d, traced.sy),
+                            hn::Set(d, traced.slant)};
+    const Sheared<V> seen(own, [&](size_t k, uint32_t axis) { return hn::Load(d, block.vertex[k][0] + axis); });
+    const V bound = seen.edge_error(own.slant, largest_of(seen.z));
     Verdict verdict{};
     const uint32_t possible = test_blocks<true>(traced, &block, true, verdict);
-    return {hn::GetLane(seen.u), hn::GetLane(seen.v),  hn::GetLane(seen.w),
-            hn::GetLane(bound),  (possible & 1U) != 0, (possible & verdict.certain & 1U) != 0,
-            verdict.lower[0],    verdict.upper[0]};
+    return {{hn::GetLane(seen.side[0]), hn::GetLane(seen.side[1]), hn::GetLane(seen.side[2])},
+            hn::GetLane(bound),
+            (possible & 1U) != 0,
+            (possible & verdict.certain & 1U) != 0,
+            verdict.lower[0],
+            verdict.upper[0]};
 }
 
 /// As Packet sets it up, for a packet of this ray and others.
@@ -135,7 +147,9 @@ inline ViewResult look(const Ray& ray, const Vec3f (&corner)[3], const SeenFromF
     const hn::CappedTag<float, 4> d;
     hn::Vec<decltype(d)> side[3];
     view.sides(d, 0, hn::Set(d, off[0]), hn::Set(d, off[1]), side);
-    return {(reached & 1U) != 0, {hn::GetLane(side[0]), hn::GetLane(side[1]), hn::GetLane(side[2])}, view.bound[0]};
+    const bool open = std::abs(hn::GetLane(depth_inside(side))) <= view.bound[0];
+    return {
+        (reached & 1U) != 0, open, {hn::GetLane(side[0]), hn::GetLane(side[1]), hn::GetLane(side[2])}, view.bound[0]};
 }
 
 inline FinishResult finish(const Ray& ray, const Vec3f (&corner)[3]) {
@@ -258,6 +272,26 @@ struct ExactTriangle {
     Exact t() const { return above / below; }
 };
 
+/// Calls check(aimed, high) for rays near triangles of some area, of all sizes below 2^high.
+template <class Check>
+void for_each_aimed(Random& random, int count, const Check& check) {
+    for (const auto& [low, high] : kRanges) {
+        for (int i = 0; i < count; ++i) {
+            const Aimed aimed = aim(random, low, high);
+            if (has_area(aimed.corner)) {
+                check(aimed, high);
+            }
+        }
+    }
+}
+
+/// How far edge functions are off: sheared, they are the weights over the direction's largest component.
+void add_edges(Share& share, const float (&side)[3], const ExactTriangle& truth, const Exact& along, float bound) {
+    for (int k = 0; k < 3; ++k) {
+        share.add(side[k] + truth.weight[k] / along, bound);
+    }
+}
+
 /// Boxes as thin as floats allow around a point of a ray.
 TEST_P(TraceBounds, OfTheBoxTestLetNoPointSlip) {
     Random random(4);
@@ -338,33 +372,21 @@ TEST_P(TraceBounds, OfTheFloatFilterHoldWhatItDoesNotDecide) {
     uint32_t invented = 0;
     uint32_t undecided = 0;
     uint32_t decided = 0;
-    for (const auto& [low, high] : kRanges) {
-        for (int i = 0; i < 5000; ++i) {
-            const Aimed aimed = aim(random, low, high);
-            const Ray& ray = aimed.ray;
-            if (!has_area(aimed.corner)) {
-                continue;
-            }
-            const FilterResult result = GetParam().filter(ray, aimed.corner);
-            const ExactTriangle truth(ray, aimed.corner);
-            // Sheared, edge functions are the weights over the direction's largest component.
-            const int kz = largest_axis(ray.direction);
-            const Exact along = ray.direction[kz];
-            const float computed[] = {result.u, result.v, result.w};
-            for (int k = 0; k < 3; ++k) {
-                edges.add(computed[k] + truth.weight[k] / along, result.bound);
-            }
-            const bool counts = truth.is_hit() && truth.t() >= 0;
-            lost += counts && !result.possible ? 1U : 0U;
-            invented += result.certain && !truth.is_hit() ? 1U : 0U;
-            decided += result.certain ? 1U : 0U;
-            undecided += result.possible && !result.certain ? 1U : 0U;
-            if (counts && result.possible && std::isfinite(result.upper)) {
-                const Exact middle = (Exact(result.lower) + result.upper) / 2;
-                depths.add(truth.t() * size_of(along) - middle, (Exact(result.upper) - result.lower) / 2);
-            }
+    for_each_aimed(random, 5000, [&](const Aimed& aimed, int) {
+        const FilterResult result = GetParam().filter(aimed.ray, aimed.corner);
+        const ExactTriangle truth(aimed.ray, aimed.corner);
+        const Exact along = aimed.ray.direction[largest_axis(aimed.ray.direction)];
+        add_edges(edges, result.side, truth, along, result.bound);
+        const bool counts = truth.is_hit() && truth.t() >= 0;
+        lost += counts && !result.possible ? 1U : 0U;
+        invented += result.certain && !truth.is_hit() ? 1U : 0U;
+        decided += result.certain ? 1U : 0U;
+        undecided += result.possible && !result.certain ? 1U : 0U;
+        if (counts && result.possible && std::isfinite(result.upper)) {
+            const Exact middle = (Exact(result.lower) + result.upper) / 2;
+            depths.add(truth.t() * size_of(along) - middle, (Exact(result.upper) - result.lower) / 2);
         }
-    }
+    });
     EXPECT_EQ(lost, 0U);
     EXPECT_EQ(invented, 0U);
     EXPECT_GT(undecided, 1000U);
@@ -382,49 +404,39 @@ TEST_P(TraceBounds, OfTheViewFromAFocusHoldForEveryRay) {
     uint32_t undecided = 0;
     uint32_t beside = 0;
     uint32_t hits = 0;
-    for (const auto& [low, high] : kRanges) {
-        for (int i = 0; i < 5000; ++i) {
-            const Aimed aimed = aim(random, low, high);
-            if (!has_area(aimed.corner)) {
-                continue;
+    for_each_aimed(random, 5000, [&](const Aimed& aimed, int high) {
+        Ray ray = aimed.ray;
+        SeenFromFocus seen{ray.origin, 0, {0, 0}, 0};
+        const bool ends_together = random.below(2) == 0;
+        if (ends_together) {
+            ray.direction = ray.direction * -std::ldexp(1.0F, high);
+            ray.origin = seen.focus - ray.direction;
+            ray.t_max = 1;
+            const Vec3f end = ray.origin + ray.direction;
+            for (int axis = 0; axis < 3; ++axis) {
+                seen.deviation += std::abs(end[axis] - seen.focus[axis]) * (1 + 0x1p-20F) +
+                                  std::abs(end[axis]) * 0x1p-23F + 0x1p-120F;
             }
-            Ray ray = aimed.ray;
-            SeenFromFocus seen{ray.origin, 0, {0, 0}, 0};
-            const bool ends_together = random.below(2) == 0;
-            if (ends_together) {
-                ray.direction = ray.direction * -std::ldexp(1.0F, high);
-                ray.origin = seen.focus - ray.direction;
-                ray.t_max = 1;
-                const Vec3f end = ray.origin + ray.direction;
-                for (int axis = 0; axis < 3; ++axis) {
-                    seen.deviation += std::abs(end[axis] - seen.focus[axis]) * (1 + 0x1p-20F) +
-                                      std::abs(end[axis]) * 0x1p-23F + 0x1p-120F;
-                }
-            }
-            const int kz = largest_axis(ray.direction);
-            if (std::abs(ray.direction[kz]) < 0x1p-100F || seen.deviation > kMaxCoordinate) {
-                continue;
-            }
-            const Exact along = ray.direction[kz];
-            seen.spread = std::ldexp(1.0F, -3 - static_cast<int>(random.below(20)));
-            for (int k = 0; k < 2; ++k) {
-                const float own = ray.direction[(kz + 1 + k) % 3] / ray.direction[kz];
-                seen.slope[k] = std::clamp(own + (4 * random.fraction() - 2) * seen.spread, -1.0F, 1.0F);
-            }
-            const ViewResult result = GetParam().look(ray, aimed.corner, seen);
-            const ExactTriangle truth(ray, aimed.corner);
-            for (int k = 0; k < 3; ++k) {
-                edges.add(result.side[k] + truth.weight[k] / along, result.bound);
-            }
-            const bool is_hit = truth.is_hit() && truth.t() >= 0 && (!ends_together || truth.t() <= 1);
-            hits += is_hit ? 1U : 0U;
-            lost += is_hit && !result.reached ? 1U : 0U;
-            beside += result.reached ? 0U : 1U;
-            const float least = std::max(std::min({result.side[0], result.side[1], result.side[2]}),
-                                         -std::max({result.side[0], result.side[1], result.side[2]}));
-            undecided += std::abs(least) <= result.bound ? 1U : 0U;
         }
-    }
+        const int kz = largest_axis(ray.direction);
+        const float along = ray.direction[kz];
+        if (std::abs(along) < 0x1p-100F || seen.deviation > kMaxCoordinate) {
+            return;
+        }
+        seen.spread = std::ldexp(1.0F, -3 - static_cast<int>(random.below(20)));
+        for (int k = 0; k < 2; ++k) {
+            const float own = ray.direction[(kz + 1 + k) % 3] / along;
+            seen.slope[k] = std::clamp(own + (4 * random.fraction() - 2) * seen.spread, -1.0F, 1.0F);
+        }
+        const ViewResult result = GetParam().look(ray, aimed.corner, seen);
+        const ExactTriangle truth(ray, aimed.corner);
+        add_edges(edges, result.side, truth, along, result.bound);
+        const bool is_hit = truth.is_hit() && truth.t() >= 0 && (!ends_together || truth.t() <= 1);
+        hits += is_hit ? 1U : 0U;
+        lost += is_hit && !result.reached ? 1U : 0U;
+        beside += result.reached ? 0U : 1U;
+        undecided += result.open ? 1U : 0U;
+    });
     EXPECT_EQ(lost, 0U);
     EXPECT_GT(hits, 3000U);
     EXPECT_GT(beside, 100U);
@@ -451,9 +463,7 @@ TEST_P(TraceBounds, OfTheViewFromAFocusHoldForSubnormalTriangles) {
         const SeenFromFocus seen{ray.origin, 0, {slope, slope}, 0.125F};
         const ViewResult result = GetParam().look(ray, corner, seen);
         const ExactTriangle truth(ray, corner);
-        for (int k = 0; k < 3; ++k) {
-            edges.add(result.side[k] + truth.weight[k] / Exact(ray.direction.z), result.bound);
-        }
+        add_edges(edges, result.side, truth, ray.direction.z, result.bound);
     }
     EXPECT_LT(edges.largest(), 1);
 }
@@ -476,22 +486,19 @@ TEST_P(TraceBounds, OfTheFinishAreKept) {
     Share distance(named("t in ulps, 12"));
     Share place(named("u and v over 2^-22.6, 12"));
     uint32_t finished = 0;
-    for (const auto& [low, high] : kRanges) {
-        for (int i = 0; i < 5000; ++i) {
-            const Aimed aimed = aim(random, low, high);
-            const ExactTriangle truth(aimed.ray, aimed.corner);
-            const FinishResult result = GetParam().finish(aimed.ray, aimed.corner);
-            if (result.open || !truth.is_hit()) {
-                continue;
-            }
-            ++finished;
-            const Exact t = truth.t();
-            const int exponent = t == 0 ? -126 : std::max(std::ilogb(size_of(t).get_d()), -126);
-            distance.add(Exact(result.t) - t, Exact(std::ldexp(1.0, exponent - 23)));
-            place.add(Exact(result.u) - truth.weight[1] / truth.below, Exact(std::exp2(-22.6)));
-            place.add(Exact(result.v) - truth.weight[2] / truth.below, Exact(std::exp2(-22.6)));
+    for_each_aimed(random, 5000, [&](const Aimed& aimed, int) {
+        const ExactTriangle truth(aimed.ray, aimed.corner);
+        const FinishResult result = GetParam().finish(aimed.ray, aimed.corner);
+        if (result.open || !truth.is_hit()) {
+            return;
         }
-    }
+        ++finished;
+        const Exact t = truth.t();
+        const int exponent = t == 0 ? -126 : std::max(std::ilogb(size_of(t).get_d()), -126);
+        distance.add(Exact(result.t) - t, Exact(std::ldexp(1.0, exponent - 23)));
+        place.add(Exact(result.u) - truth.weight[1] / truth.below, Exact(std::exp2(-22.6)));
+        place.add(Exact(result.v) - truth.weight[2] / truth.below, Exact(std::exp2(-22.6)));
+    });
     EXPECT_GT(finished, 3000U);
     EXPECT_LT(distance.largest(), 0.5626);
     EXPECT_GT(distance.largest(), 0.4);
@@ -509,36 +516,30 @@ TEST(DoubleBounds, OfSidesAndDistances) {
     Share estimate_share("estimate of an expansion, 10");
     uint32_t different = 0;
     uint32_t open = 0;
-    for (const auto& [low, high] : kRanges) {
-        for (int i = 0; i < 6000; ++i) {
-            const Aimed aimed = aim(random, low, high);
-            if (!has_area(aimed.corner)) {
-                continue;
-            }
-            const Ray& ray = aimed.ray;
-            const ExactTriangle truth(ray, aimed.corner);
-            Vec3d p[3];
-            for (int k = 0; k < 3; ++k) {
-                p[k] = to_double(aimed.corner[k]) - to_double(ray.origin);
-            }
-            for (int k = 0; k < 3; ++k) {
-                const Vec3d edge = to_double(aimed.corner[(k + 2) % 3]) - to_double(aimed.corner[(k + 1) % 3]);
-                const Side side = measure_side(to_double(ray.direction), p[(k + 1) % 3], edge);
-                side_share.add(side.value - truth.weight[k], side.error);
-                open += std::abs(side.value) <= side.error ? 1U : 0U;
-            }
-            ExactHit hit;
-            const bool is_hit = hit_exactly(ray.origin, ray.direction, aimed.corner, hit);
-            different += is_hit != truth.is_hit() ? 1U : 0U;
-            if (!is_hit) {
-                continue;
-            }
-            distance_share.add(hit.t - truth.t(), hit.error);
-            finish_hit(ray.origin, ray.direction, hit);
-            place_share.add(hit.u - truth.weight[1] / truth.below, Exact(std::exp2(-22.9)));
-            place_share.add(hit.v - truth.weight[2] / truth.below, Exact(std::exp2(-22.9)));
+    for_each_aimed(random, 6000, [&](const Aimed& aimed, int) {
+        const Ray& ray = aimed.ray;
+        const ExactTriangle truth(ray, aimed.corner);
+        Vec3d p[3];
+        for (int k = 0; k < 3; ++k) {
+            p[k] = to_double(aimed.corner[k]) - to_double(ray.origin);
         }
-    }
+        for (int k = 0; k < 3; ++k) {
+            const Vec3d edge = to_double(aimed.corner[(k + 2) % 3]) - to_double(aimed.corner[(k + 1) % 3]);
+            const Side side = measure_side(to_double(ray.direction), p[(k + 1) % 3], edge);
+            side_share.add(side.value - truth.weight[k], side.error);
+            open += std::abs(side.value) <= side.error ? 1U : 0U;
+        }
+        ExactHit hit;
+        const bool is_hit = hit_exactly(ray.origin, ray.direction, aimed.corner, hit);
+        different += is_hit != truth.is_hit() ? 1U : 0U;
+        if (!is_hit) {
+            return;
+        }
+        distance_share.add(hit.t - truth.t(), hit.error);
+        finish_hit(ray.origin, ray.direction, hit);
+        place_share.add(hit.u - truth.weight[1] / truth.below, Exact(std::exp2(-22.9)));
+        place_share.add(hit.v - truth.weight[2] / truth.below, Exact(std::exp2(-22.9)));
+    });
     EXPECT_EQ(different, 0U);
     EXPECT_LT(side_share.largest(), 1);
     EXPECT_GT(side_share.largest(), 0.05);
