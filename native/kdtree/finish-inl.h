@@ -17,6 +17,7 @@
 #include <type_traits>
 
 #include "kdtree/candidate.h"
+#include "kdtree/ray_batch-inl.h"
 #include "kdtree/traced_ray-inl.h"
 #include "kdtree/triangle_test-inl.h"
 
@@ -69,18 +70,13 @@ HWY_INLINE uint32_t finish(FinishBatch& batch) {
         VF direction[3];
         hn::LoadInterleaved4(df, batch.origin[first], origin[0], origin[1], origin[2], unused);
         hn::LoadInterleaved4(df, batch.direction[first], direction[0], direction[1], direction[2], unused);
-        const VF size[3] = {hn::Abs(direction[0]), hn::Abs(direction[1]), hn::Abs(direction[2])};
-        const auto x_over_y = hn::Gt(size[0], size[1]);
-        const auto not_z = hn::Gt(hn::Max(size[0], size[1]), size[2]);
-        // The axes in such an order that z has the direction's largest component.
+        const LaneAxes<VF> axes(direction);
         const auto permute = [&](const VF(&from)[3], V(&to)[3]) {
             for (size_t axis = 0; axis < 3; ++axis) {
-                const VF permuted = hn::IfThenElse(
-                    not_z, hn::IfThenElse(x_over_y, from[(axis + 1) % 3], from[(axis + 2) % 3]), from[axis]);
                 if constexpr (kExact) {
-                    to[axis] = hn::PromoteTo(d, permuted);
+                    to[axis] = hn::PromoteTo(d, axes.pick(from, axis));
                 } else {
-                    to[axis] = permuted;
+                    to[axis] = axes.pick(from, axis);
                 }
             }
         };

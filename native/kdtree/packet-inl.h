@@ -18,6 +18,7 @@
 #include "kdtree/candidate.h"
 #include "kdtree/focus_view-inl.h"
 #include "kdtree/on_demand.h"
+#include "kdtree/ray_batch-inl.h"
 #include "kdtree/traced_ray-inl.h"
 #include "kdtree/triangle_test-inl.h"
 
@@ -107,20 +108,14 @@ class Packet {
 
     /// Lays the rays out component by component.
     HWY_INLINE void unpack() {
-        static_assert(sizeof(Ray) == 8 * sizeof(float));
         for (size_t lane = 0; lane < kRays; lane += kLanes) {
-            // A ray is a pair of quadruples: origins get into even lanes, directions into odd ones.
-            const auto* from = reinterpret_cast<const float*>(rays_ + lane);
-            V low[4];
-            V high[4];
-            hn::LoadInterleaved4(d, from, low[0], low[1], low[2], low[3]);
-            hn::LoadInterleaved4(d, from + 4 * kLanes, high[0], high[1], high[2], high[3]);
+            const RayColumns<V> given(d, rays_ + lane);
             for (size_t axis = 0; axis < 3; ++axis) {
-                hn::Store(hn::ConcatEven(d, high[axis], low[axis]), d, origin_[axis] + lane);
-                hn::Store(hn::ConcatOdd(d, high[axis], low[axis]), d, direction_[axis] + lane);
+                hn::Store(given.origin[axis], d, origin_[axis] + lane);
+                hn::Store(given.direction[axis], d, direction_[axis] + lane);
             }
-            hn::Store(hn::ConcatEven(d, high[3], low[3]), d, t_min_ + lane);
-            hn::Store(hn::ConcatOdd(d, high[3], low[3]), d, t_max_ + lane);
+            hn::Store(given.t_min, d, t_min_ + lane);
+            hn::Store(given.t_max, d, t_max_ + lane);
         }
     }
 
@@ -220,33 +215,23 @@ class Packet {
         return true;
     }
 
-    /// As in TracedRay::start_from, for the rays and for the two that bound them.
+    /// For the rays and for the two that bound them.
     HWY_INLINE void set_up_boxes(Vec3f focus, Vec3f deviation, Vec3f towards, int kz) {
         octant_ = 0;
-        const float farthest = extent_ + std::max({std::abs(focus.x), std::abs(focus.y), std::abs(focus.z)});
+        const V farthest = hn::Set(d, extent_ + std::max({std::abs(focus.x), std::abs(focus.y), std::abs(focus.z)}));
         for (int axis = 0; axis < 3; ++axis) {
-            const bool negative = towards[axis] < 0;
-            octant_ |= negative ? 1U << axis : 0U;
+            const bool is_negative = towards[axis] < 0;
+            octant_ |= is_negative ? 1U << axis : 0U;
             const auto planes = static_cast<uint32_t>(axis * WideNode::kWidth);
-            near_planes_[axis] = planes + (negative ? 3 * WideNode::kWidth : 0);
-            far_planes_[axis] = planes + (negative ? 0 : 3 * WideNode::kWidth);
+            near_planes_[axis] = planes + (is_negative ? 3 * WideNode::kWidth : 0);
+            far_planes_[axis] = planes + (is_negative ? 0 : 3 * WideNode::kWidth);
+            const auto negative = hn::Lt(hn::Set(d, towards[axis]), hn::Zero(d));
+            const auto slab_of = [&](V steepness) {
+                return Slab<V>(hn::Set(d, focus[axis]), steepness, negative, extent_, farthest,
+                               hn::Set(d, deviation[axis]));
+            };
             V least = hn::Set(d, kInfinity);
             V most = hn::Zero(d);
-            const auto shifts = [&](V steepness, V& near, V& far) {
-                const V inverse = negative ? hn::Neg(steepness) : steepness;
-                const V shift = hn::Neg(hn::Mul(hn::Set(d, focus[axis]), inverse));
-                V room = hn::Abs(shift);
-#if !HWY_NATIVE_FMA
-                room = hn::MulAdd(hn::Set(d, extent_), steepness, room);
-#endif
-                const V flat = hn::IfThenElse(hn::Ge(steepness, hn::Set(d, 0x1p24F)), hn::Set(d, farthest * 0x1p-22F),
-                                              hn::Zero(d));
-                const V margin = hn::MulAdd(hn::Add(flat, hn::Set(d, deviation[axis])), steepness,
-                                            hn::MulAdd(room, hn::Set(d, 0x1p-22F), hn::Set(d, kTiny)));
-                near = hn::Sub(shift, margin);
-                far = hn::Add(shift, margin);
-                return inverse;
-            };
             for (size_t lane = 0; lane < kRays; lane += kLanes) {
                 const V largest = hn::Abs(hn::Load(d, direction_[kz] + lane));
                 const V own =
@@ -254,18 +239,17 @@ class Packet {
                 const V steepness = axis == kz ? hn::Set(d, 1.0F) : hn::Div(largest, own);
                 least = hn::Min(least, steepness);
                 most = hn::Max(most, steepness);
-                V near, far;
-                const V inverse = shifts(steepness, near, far);
-                hn::Store(inverse, d, inverse_[axis] + lane);
-                hn::Store(near, d, near_shift_[axis] + lane);
-                hn::Store(far, d, far_shift_[axis] + lane);
+                const Slab<V> slab = slab_of(steepness);
+                hn::Store(slab.inverse, d, inverse_[axis] + lane);
+                hn::Store(slab.near_shift, d, near_shift_[axis] + lane);
+                hn::Store(slab.far_shift, d, far_shift_[axis] + lane);
             }
             const V ends[2] = {hn::MinOfLanes(d, least), hn::MaxOfLanes(d, most)};
             for (size_t end = 0; end < 2; ++end) {
-                V near, far;
-                bound_inverse_[axis][end] = hn::GetLane(shifts(ends[end], near, far));
-                bound_near_[axis][end] = hn::GetLane(near);
-                bound_far_[axis][end] = hn::GetLane(far);
+                const Slab<V> slab = slab_of(ends[end]);
+                bound_inverse_[axis][end] = hn::GetLane(slab.inverse);
+                bound_near_[axis][end] = hn::GetLane(slab.near_shift);
+                bound_far_[axis][end] = hn::GetLane(slab.far_shift);
             }
         }
     }
@@ -277,22 +261,16 @@ class Packet {
             const V size = hn::Abs(hn::Load(d, direction_[kz] + lane));
             const V t_min = hn::Load(d, t_min_ + lane);
             const V t_max = hn::Load(d, t_max_ + lane);
-            const V tiny = hn::Set(d, kTiny);
-            const V below = hn::Set(d, 1 - 0x1p-21F);
-            const V above = hn::Set(d, 1 + 0x1p-21F);
-            const V from = hn::Mul(t_min, size);
-            const V to = hn::Mul(t_max, size);
-            const V start = hn::Sub(hn::Mul(from, below), tiny);
-            const V reach = hn::MulAdd(to, hn::Set(d, 1 + 0x1p-20F), tiny);
-            hn::Store(start, d, start_ + lane);
-            hn::Store(reach, d, reaches_ + lane);
-            hn::Store(hn::MulAdd(from, above, tiny), d, sure_start_ + lane);
-            hn::Store(hn::Sub(hn::Mul(to, below), tiny), d, sure_end_ + lane);
+            const DepthLimits<V> limits(t_min, t_max, size);
+            hn::Store(limits.start, d, start_ + lane);
+            hn::Store(limits.reach, d, reaches_ + lane);
+            hn::Store(limits.sure_start, d, sure_start_ + lane);
+            hn::Store(limits.sure_end, d, sure_end_ + lane);
             hn::Store(hn::Inf(d), d, lower_ + lane);
             hn::Store(hn::Set(du, kNoPlace), du, place_ + lane);
             hn::Store(hn::Set(du, kNoTriangle), du, triangle_ + lane);
-            V box_start = start;
-            V box_reach = reach;
+            V box_start = limits.start;
+            V box_reach = limits.reach;
             if (is_reversed_) {
                 const V one = hn::Set(d, 1.0F);
                 const V room = hn::MulAdd(size, hn::Set(d, 0x1p-21F), hn::Set(d, deviation));
@@ -489,7 +467,7 @@ class Packet {
         const Sheared<V> seen(own,
                               [&](size_t k, uint32_t axis) { return hn::Set(d, corners[k * 3 * kBlockSize + axis]); });
         const V mz = largest_of(seen.z);
-        const V bound = kExact ? seen.edge_error(own.slant, mz) : hn::Zero(d);
+        const V bound = kExact ? hn::Neg(seen.minus_edge_error(own.slant, mz)) : hn::Zero(d);
         const V inwards = depth_inside(seen.side);
         const auto inside = hn::And(hn::Ge(inwards, hn::Neg(bound)), hn::Ge(hn::Load(d, reaches_ + lane), hn::Zero(d)));
         if (hn::AllFalse(d, inside)) {

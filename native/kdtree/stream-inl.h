@@ -11,12 +11,14 @@
 
 #include <hwy/highway.h>
 
+#include <algorithm>
 #include <bit>
 #include <cstdint>
+#include <iterator>
 #include <span>
 #include <utility>
 
-#include "kdtree/finish-inl.h"
+#include "kdtree/ray_batch-inl.h"
 #include "kdtree/traced_ray-inl.h"
 #include "kdtree/triangle_test-inl.h"
 
@@ -122,29 +124,29 @@ class Stream {
           extent_(extent_of(tree)),
           rays_(rays) {}
 
-    /// Traces the rays of these numbers and calls done(ray) for each when its way has ended.
+    /// Traces rays, batches of them from these numbers on, and calls done(ray) for each when its way has ended.
     template <class Done>
-    HWY_INLINE void run(std::span<const uint32_t> numbers, const Done& done) {
-        size_t begun = 0;
-        const size_t count = numbers.size();
-        for (uint32_t slot = 0; slot < kInFlight && begun < count; ++slot) {
-            begin(ray_[slot], numbers[begun++]);
+    HWY_INLINE void run(std::span<const uint32_t> batches, const Done& done) {
+        batches_ = batches;
+        Lists lists;
+        for (uint32_t slot = 0; slot < kInFlight; ++slot) {
+            begin(ray_[slot], lists);
         }
-        while ((at_node_ | at_leaf_ | at_end_) != 0) {
+        while ((lists.at_node | lists.at_leaf | lists.at_end) != 0) {
             // Each list is read from its front while rays are put behind; as each ray is put back once at most, a list
             // may be refilled while it is read.
-            const uint32_t nodes = std::exchange(at_node_, 0);
+            const uint32_t nodes = std::exchange(lists.at_node, 0);
             for (uint32_t i = 0; i < nodes; ++i) {
                 StreamRay& ray = *node_list_[i];
                 visit_node(ray, nodes_[ray.next]);
-                go_on(ray, *--ray.top);
+                go_on(ray, *--ray.top, lists);
             }
-            const uint32_t leaves = std::exchange(at_leaf_, 0);
+            const uint32_t leaves = std::exchange(lists.at_leaf, 0);
             for (uint32_t i = 0; i < leaves; ++i) {
                 StreamRay& ray = *leaf_list_[i];
                 const uint32_t leaf = ray.next;
                 if (WideNode::is_unopened(leaf)) [[unlikely]] {
-                    go_on(ray, on_demand_->open(leaf));
+                    go_on(ray, on_demand_->open(leaf), lists);
                     continue;
                 }
                 const uint32_t further = leaf % WideNode::kMaxLeafBlocks;  // blocks behind the first
@@ -153,7 +155,7 @@ class Stream {
                 const uint32_t possible = test_blocks<kExact>(ray, blocks_ + block, further == 0, verdict);
                 if (possible != 0 && take(ray, verdict, possible, block)) {
                     if constexpr (kAnyHit) {
-                        end_list_[at_end_++] = &ray;
+                        end_list_[lists.at_end++] = &ray;
                         continue;
                     } else {
                         ray.prune();
@@ -164,14 +166,12 @@ class Stream {
                 const uint32_t rest = leaf + (WideNode::kMaxLeafBlocks - 1) * kBlocksPerStep;
                 const uint32_t top = ray.top[-1];
                 ray.top -= is_last ? 1 : 0;
-                go_on(ray, is_last ? top : rest);
+                go_on(ray, is_last ? top : rest, lists);
             }
-            const uint32_t ended = std::exchange(at_end_, 0);
+            const uint32_t ended = std::exchange(lists.at_end, 0);
             for (uint32_t i = 0; i < ended; ++i) {
                 done(*end_list_[i]);
-                if (begun < count) {
-                    begin(*end_list_[i], numbers[begun++]);
-                }
+                begin(*end_list_[i], lists);
             }
         }
     }
@@ -179,25 +179,56 @@ class Stream {
  private:
     static constexpr uint32_t kInFlight = 32;
 
-    HWY_INLINE void begin(StreamRay& ray, uint32_t number) {
-        ray.start_from(rays_[number], extent_);
-        ray.number = number;
+    /// How many rays are on each list. Not beside the lists: what is written to those and to rays might be these, for
+    /// all a compiler knows, and they would be read back at every step.
+    struct Lists {
+        uint32_t at_node = 0;
+        uint32_t at_leaf = 0;
+        uint32_t at_end = 0;
+    };
+
+    /// Puts the next ray, if there is one, in place of one that has ended.
+    HWY_INLINE void begin(StreamRay& ray, Lists& lists) {
+        if (next_ == end_ && !set_up_next_batch()) {
+            return;
+        }
+        batch_.copy(next_ % RayBatch::kSize, ray);
+        ray.number = next_++;
         ray.next = 0;
         ray.clear_stack();
-        node_list_[at_node_++] = &ray;
+        node_list_[lists.at_node++] = &ray;
+    }
+
+    HWY_NOINLINE bool set_up_next_batch() {
+        if (batches_.empty()) {
+            return false;
+        }
+        next_ = batches_.front();
+        batches_ = batches_.subspan(1);
+        const std::span<const Ray> rays = rays_.subspan(next_, std::min(RayBatch::kSize, rays_.size() - next_));
+        end_ = next_ + static_cast<uint32_t>(rays.size());
+        if (rays.size() == RayBatch::kSize) {
+            batch_.set_up(rays.data(), extent_);
+        } else {
+            Ray filled_up[RayBatch::kSize];
+            std::fill(std::copy(rays.begin(), rays.end(), filled_up), std::end(filled_up), rays.front());
+            batch_.set_up(filled_up, extent_);
+        }
+        return true;
     }
 
     /// Puts a ray on the list of what it does next, and has the memory for that fetched, without a branch on which.
-    HWY_INLINE void go_on(StreamRay& ray, uint32_t child) {
+    HWY_INLINE void go_on(StreamRay& ray, uint32_t child, Lists& lists) {
         ray.next = child;
-        const bool is_end = child == StreamRay::kNothing;
+        static_assert(StreamRay::kNothing == 0);
         const uint32_t is_leaf = child >> 31;
-        leaf_list_[at_leaf_] = &ray;
-        node_list_[at_node_] = &ray;
-        end_list_[at_end_] = &ray;
-        at_leaf_ += is_leaf;
-        at_node_ += (1 - is_leaf) & (is_end ? 0 : 1);
-        at_end_ += is_end ? 1 : 0;
+        const uint32_t is_end = (~child & (child - 1)) >> 31;  // child == 0, for which compilers would branch
+        leaf_list_[lists.at_leaf] = &ray;
+        node_list_[lists.at_node] = &ray;
+        end_list_[lists.at_end] = &ray;
+        lists.at_leaf += is_leaf;
+        lists.at_node += 1 - is_leaf - is_end;
+        lists.at_end += is_end;
         const auto node = reinterpret_cast<uintptr_t>(nodes_ + child);
         const auto block = reinterpret_cast<uintptr_t>(blocks_ + WideNode::first_block(child));
         // A choice that compilers would make with a branch.
@@ -211,43 +242,48 @@ class Stream {
     /// Takes in what a block's test has found. Returns whether there is a new nearest hit.
     HWY_INLINE bool take(StreamRay& ray, const Verdict& verdict, uint32_t possible, uint32_t block) {
         bool taken = false;
+        uint32_t open = 0;
         for (uint32_t lanes = possible; lanes != 0; lanes &= lanes - 1) {
             const auto lane = static_cast<uint32_t>(std::countr_zero(lanes));
-            taken |= take_lane(ray, verdict.lower[lane], verdict.upper[lane], (verdict.certain >> lane & 1U) != 0,
-                               block * kBlockSize + lane);
-            if (kAnyHit && taken) {
-                return true;
+            const float lower = verdict.lower[lane];
+            const float upper = verdict.upper[lane];
+            const bool is_sure =
+                !kExact || ((verdict.certain >> lane & 1U) != 0 && lower >= ray.sure_start && upper <= ray.sure_end);
+            if (is_sure && upper < ray.lower) {
+                ray.place = block * kBlockSize + lane;
+                ray.shorten(lower, upper);
+                taken = true;
+                if (kAnyHit) {
+                    return true;
+                }
+            } else {
+                open |= lanes & -lanes;
             }
+        }
+        if (kExact && open != 0) [[unlikely]] {
+            taken |= take_open(ray, verdict, open, block);
         }
         return taken;
     }
 
-    HWY_INLINE bool take_lane(StreamRay& ray, float lower, float upper, bool certain, uint32_t place) {
-        if (!kExact || (certain && lower >= ray.sure_start && upper <= ray.sure_end && upper < ray.lower)) {
-            if (!kExact && upper >= ray.upper) {
-                return false;
+    /// Takes in those lanes that need exact arithmetic.
+    HWY_NOINLINE bool take_open(StreamRay& ray, const Verdict& verdict, uint32_t open, uint32_t block) {
+        bool taken = false;
+        for (; open != 0; open &= open - 1) {
+            const auto lane = static_cast<uint32_t>(std::countr_zero(open));
+            const uint32_t place = block * kBlockSize + lane;
+            if (verdict.lower[lane] > ray.reach ||
+                (ray.place != kNoPlace && triangle_at(blocks_, ray.place) == triangle_at(blocks_, place))) {
+                continue;
             }
-            ray.place = place;
-            ray.shorten(lower, upper);
-            return true;
+            Nearest nearest{ray.place, ray.lower, ray.upper};
+            if (take_exactly(rays_[ray.number], blocks_, place, nearest)) {
+                ray.place = place;
+                ray.shorten(nearest.lower, nearest.upper);
+                taken = true;
+            }
         }
-        if (lower > ray.reach) {
-            return false;
-        }
-        return take_open(ray, place);
-    }
-
-    HWY_NOINLINE bool take_open(StreamRay& ray, uint32_t place) {
-        if (ray.place != kNoPlace && triangle_at(blocks_, ray.place) == triangle_at(blocks_, place)) {
-            return false;
-        }
-        Nearest nearest{ray.place, ray.lower, ray.upper};
-        if (!take_exactly(rays_[ray.number], blocks_, place, nearest)) {
-            return false;
-        }
-        ray.place = place;
-        ray.shorten(nearest.lower, nearest.upper);
-        return true;
+        return taken;
     }
 
     const WideNode* nodes_;
@@ -255,9 +291,10 @@ class Stream {
     OnDemand* on_demand_;
     float extent_;
     std::span<const Ray> rays_;
-    uint32_t at_node_ = 0;
-    uint32_t at_leaf_ = 0;
-    uint32_t at_end_ = 0;
+    std::span<const uint32_t> batches_;  ///< those not yet set up, by the numbers of their first rays
+    RayBatch batch_;
+    uint32_t next_ = 0;  ///< the next ray of the batch, and the end of it
+    uint32_t end_ = 0;
     StreamRay* node_list_[kInFlight + 1];
     StreamRay* leaf_list_[kInFlight + 1];
     StreamRay* end_list_[kInFlight + 1];

@@ -16,6 +16,7 @@
 
 #include "kdtree/finish-inl.h"
 #include "kdtree/packet-inl.h"
+#include "kdtree/ray_batch-inl.h"
 #include "kdtree/stream-inl.h"
 
 HWY_BEFORE_NAMESPACE();
@@ -26,29 +27,26 @@ template <bool kAnyHit, bool kExact, class Done>
 HWY_INLINE void trace(const Tree& tree, std::span<const Ray> rays, const Done& done) {
     constexpr size_t kChunk = 4096;
     constexpr size_t kPacket = Packet<kAnyHit, kExact>::kRays;
+    static_assert(kChunk % kPacket == 0 && kPacket % RayBatch::kSize == 0);
     Packet<kAnyHit, kExact> packet(tree);
     Stream<kAnyHit, kExact> stream(tree, rays);
-    uint32_t single[kChunk];
+    uint32_t batches[kChunk / RayBatch::kSize];
     for (size_t begin = 0; begin < rays.size(); begin += kChunk) {
         const size_t end = std::min(begin + kChunk, rays.size());
-        size_t singles = 0;
-        size_t i = begin;
-        for (; i + kPacket <= end; i += kPacket) {
-            if (packet.gather(&rays[i])) {
+        size_t count = 0;
+        for (size_t i = begin; i < end; i += kPacket) {
+            if (i + kPacket <= end && packet.gather(&rays[i])) {
                 packet.trace();
                 for (size_t lane = 0; lane < kPacket; ++lane) {
                     done(static_cast<uint32_t>(i + lane), packet.place(lane));
                 }
             } else {
-                for (size_t lane = 0; lane < kPacket; ++lane) {
-                    single[singles++] = static_cast<uint32_t>(i + lane);
+                for (size_t first = i; first < std::min(i + kPacket, end); first += RayBatch::kSize) {
+                    batches[count++] = static_cast<uint32_t>(first);
                 }
             }
         }
-        for (; i < end; ++i) {
-            single[singles++] = static_cast<uint32_t>(i);
-        }
-        stream.run({single, singles}, [&](const StreamRay& ray) { done(ray.number, ray.place); });
+        stream.run({batches, count}, [&](const StreamRay& ray) { done(ray.number, ray.place); });
     }
 }
 

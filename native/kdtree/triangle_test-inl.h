@@ -33,23 +33,6 @@ struct Verdict {
     uint32_t certain;  ///< lanes that the line meets, by whatever depth
 };
 
-#if HWY_TARGET <= HWY_AVX3
-/// The larger of the sizes of two numbers by one operation.
-HWY_INLINE __m512 larger_of(__m512 a, __m512 b) { return _mm512_range_ps(a, b, 0xb); }
-HWY_INLINE __m512d larger_of(__m512d a, __m512d b) { return _mm512_range_pd(a, b, 0xb); }
-#endif
-
-/// The largest of the sizes of three numbers.
-template <class V>
-HWY_INLINE V largest_of(const V (&c)[3]) {
-#if HWY_TARGET <= HWY_AVX3
-    if constexpr (sizeof(V) == 64) {
-        return V{larger_of(larger_of(c[0].raw, c[1].raw), c[2].raw)};
-    }
-#endif
-    return hn::Max(hn::Max(hn::Abs(c[0]), hn::Abs(c[1])), hn::Abs(c[2]));
-}
-
 /// Reads blocks lane by lane, those of a second block behind the first's; a single block stands for both.
 class BlockLoader {
  public:
@@ -101,12 +84,14 @@ struct Sheared {
         side[2] = hn::MulSub(x[1], y[0], hn::Mul(y[1], x[0]));
     }
 
-    /// More than the error of any of the three edge functions; mz: the largest |z| of the corners. EXACTNESS.md, 8.
-    HWY_INLINE V edge_error(V slant, V mz) const {
+    /// Less than minus the error of any of the three edge functions; mz: the largest |z| of the corners. EXACTNESS.md,
+    /// 8.
+    HWY_INLINE V minus_edge_error(V slant, V mz) const {
         const hn::DFromV<V> d;
-        const V s = hn::MulAdd(hn::Mul(hn::Set(d, 5.5F), slant), mz, hn::Add(largest_of(x), largest_of(y)));
-        const V slope = hn::MulAdd(hn::Mul(hn::Set(d, 10.5F), slant), mz, hn::Mul(hn::Set(d, 3.25F * 0x1p-24F), s));
-        return hn::MulAdd(s, slope, hn::Set(d, kTiny));
+        const V lean = hn::Mul(slant, mz);
+        const V s = hn::MulAdd(hn::Set(d, 5.5F), lean, hn::Add(largest_of(x), largest_of(y)));
+        const V slope = hn::MulAdd(hn::Set(d, 10.5F), lean, hn::Mul(hn::Set(d, 3.25F * 0x1p-24F), s));
+        return hn::NegMulSub(s, slope, hn::Set(d, kTiny));
     }
 };
 
@@ -142,11 +127,11 @@ HWY_INLINE DepthRange<V> depth_range(const V (&side)[3], V bound, V mz, V z0, V 
     if constexpr (!kExact) {
         return {depth, depth, hn::Eq(depth, depth)};
     }
-    const V doubt =
-        hn::Mul(hn::Mul(hn::Mul(hn::Set(d, 8.5F), bound), hn::Abs(inverse)), hn::Max(hn::Abs(r1), hn::Abs(r2)));
-    const V error = hn::MulAdd(hn::Set(d, 0x1p-19F), mz, hn::Add(doubt, hn::Set(d, kTiny)));
-    // So small a det may have no reciprocal.
-    const auto is_sound = hn::Ge(hn::Abs(det), hn::Max(hn::Mul(hn::Set(d, 32), bound), hn::Set(d, 0x1p-120F)));
+    // So small a det that it may have no reciprocal makes this infinite.
+    const V share = hn::Mul(bound, hn::Abs(inverse));
+    const auto is_sound = hn::Le(share, hn::Set(d, 1.0F / 33));
+    const V doubt = hn::Mul(share, largest_of(r1, r2));
+    const V error = hn::MulAdd(hn::Set(d, 8.5F), doubt, hn::MulAdd(hn::Set(d, 0x1p-19F), mz, hn::Set(d, kTiny)));
     return {hn::IfThenElse(is_sound, hn::Sub(depth, error), hn::Set(d, -kInfinity)),
             hn::IfThenElse(is_sound, hn::Add(depth, error), hn::Set(d, kInfinity)), is_sound};
 }
@@ -181,16 +166,17 @@ HWY_INLINE uint32_t test_blocks(const TracedRay& ray, const TriangleBlock* block
         const Sheared<V> seen(sheared,
                               [&](size_t k, uint32_t axis) { return load(k * 3 * kBlockSize + first + axis); });
         const V inwards = depth_inside(seen.side);  // lanes without a triangle are NaN and fail
-        V bound = hn::Zero(d);
-        V mz = bound;
+        V below = hn::Zero(d);
+        V mz = below;
         if constexpr (kExact) {
             mz = largest_of(seen.z);
-            bound = seen.edge_error(sheared.slant, mz);
+            below = seen.minus_edge_error(sheared.slant, mz);
         }
-        const auto inside = hn::Ge(inwards, hn::Neg(bound));
+        const auto inside = hn::Ge(inwards, below);
         if (hn::AllFalse(d, inside)) {
             continue;
         }
+        const V bound = hn::Neg(below);
         const V(&z)[3] = seen.z;
         const DepthRange<V> depth =
             depth_range<kExact>(seen.side, bound, mz, z[0], hn::Sub(z[1], z[0]), hn::Sub(z[2], z[0]), ray.sign);

@@ -15,6 +15,7 @@
 
 #include "kdtree/finish-inl.h"
 #include "kdtree/focus_view-inl.h"
+#include "kdtree/ray_batch-inl.h"
 #include "kdtree/triangle_test-inl.h"
 
 #ifndef ESPALIER_TEST_TRACE_BOUNDS_TYPES
@@ -55,10 +56,19 @@ HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
 namespace hn = hwy::HWY_NAMESPACE;
 
+inline TracedRay set_up(const Ray& ray, float extent) {
+    Ray rays[RayBatch::kSize];
+    std::fill(std::begin(rays), std::end(rays), ray);
+    RayBatch batch;
+    batch.set_up(rays, extent);
+    TracedRay traced;
+    batch.copy(0, traced);
+    return traced;
+}
+
 inline DepthsResult depths_of(const Ray& ray, float extent, const Box3f& box) {
     const hn::CappedTag<float, 4> d;
-    TracedRay traced;
-    traced.start_from(ray, extent);
+    const TracedRay traced = set_up(ray, extent);
     DepthsResult result;
     result.entry = traced.start;
     result.exit = traced.reach;
@@ -92,8 +102,7 @@ inline TriangleBlock block_of(const Vec3f (&corner)[3]) {
 
 inline FilterResult filter(const Ray& ray, const Vec3f (&corner)[3]) {
     const TriangleBlock block = block_of(corner);
-    TracedRay traced;
-    traced.start_from(ray, kMaxCoordinate);
+    const TracedRay traced = set_up(ray, kMaxCoordinate);
     const hn::CappedTag<float, kBlockSize> d;
     using V = hn::Vec<decltype(d)>;
     const ShearedRay<V> own{traced.x,
@@ -106,7 +115,7 @@ inline FilterResult filter(const Ray& ray, const Vec3f (&corner)[3]) {
                             hn::Set(d, traced.sy),
                             hn::Set(d, traced.slant)};
     const Sheared<V> seen(own, [&](size_t k, uint32_t axis) { return hn::Load(d, block.vertex[k][0] + axis); });
-    const V bound = seen.edge_error(own.slant, largest_of(seen.z));
+    const V bound = hn::Neg(seen.minus_edge_error(own.slant, largest_of(seen.z)));
     Verdict verdict{};
     const uint32_t possible = test_blocks<true>(traced, &block, true, verdict);
     return {{hn::GetLane(seen.side[0]), hn::GetLane(seen.side[1]), hn::GetLane(seen.side[2])},

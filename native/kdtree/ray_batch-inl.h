@@ -1,0 +1,209 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+// Rays made ready for the box test and the triangle test, a register of them at a time. Compiled once per instruction
+// set (see traversal.cpp).
+
+#if defined(ESPALIER_KDTREE_RAY_BATCH_INL_H_) == defined(HWY_TARGET_TOGGLE)
+#ifdef ESPALIER_KDTREE_RAY_BATCH_INL_H_
+#undef ESPALIER_KDTREE_RAY_BATCH_INL_H_
+#else
+#define ESPALIER_KDTREE_RAY_BATCH_INL_H_
+#endif
+
+#include <hwy/highway.h>
+
+#include <cstdint>
+
+#include "kdtree/node.h"
+#include "kdtree/traced_ray-inl.h"
+#include "kdtree/traversal.h"
+
+HWY_BEFORE_NAMESPACE();
+namespace espalier::HWY_NAMESPACE {
+namespace hn = hwy::HWY_NAMESPACE;
+
+/// Rays component by component.
+template <class V>
+struct RayColumns {
+    V origin[3];
+    V direction[3];
+    V t_min;
+    V t_max;
+
+    /// A register of rays from `rays` on.
+    template <class D>
+    HWY_INLINE RayColumns(D d, const Ray* rays) {
+        static_assert(sizeof(Ray) == 8 * sizeof(float));
+        // A ray is a pair of quadruples: origins get into even lanes, directions into odd ones.
+        const auto* from = reinterpret_cast<const float*>(rays);
+        V low[4];
+        V high[4];
+        hn::LoadInterleaved4(d, from, low[0], low[1], low[2], low[3]);
+        hn::LoadInterleaved4(d, from + 4 * hn::Lanes(d), high[0], high[1], high[2], high[3]);
+        for (size_t axis = 0; axis < 3; ++axis) {
+            origin[axis] = hn::ConcatEven(d, high[axis], low[axis]);
+            direction[axis] = hn::ConcatOdd(d, high[axis], low[axis]);
+        }
+        t_min = hn::ConcatEven(d, high[3], low[3]);
+        t_max = hn::ConcatOdd(d, high[3], low[3]);
+    }
+};
+
+/// As Axes, for rays in lanes: what an axis turns into once z is the one of the direction's largest component.
+template <class V>
+class LaneAxes {
+ public:
+    HWY_INLINE explicit LaneAxes(const V (&direction)[3]) {
+        const V size[3] = {hn::Abs(direction[0]), hn::Abs(direction[1]), hn::Abs(direction[2])};
+        x_over_y_ = hn::Gt(size[0], size[1]);
+        not_z_ = hn::Gt(hn::Max(size[0], size[1]), size[2]);
+    }
+
+    HWY_INLINE V pick(const V (&from)[3], size_t axis) const {
+        return hn::IfThenElse(not_z_, hn::IfThenElse(x_over_y_, from[(axis + 1) % 3], from[(axis + 2) % 3]),
+                              from[axis]);
+    }
+
+ private:
+    hn::Mask<hn::DFromV<V>> x_over_y_;
+    hn::Mask<hn::DFromV<V>> not_z_;
+};
+
+/// Where rays meet planes across one axis: at depths plane * inverse + shift, where the shift already holds a margin,
+/// towards the ray's start for near planes and away from it for far ones.
+///
+/// With u = 2^-24: inverse is off by a relative u, its product with the origin by another, and the sum by one of its
+/// result. The error of a plane's depth is therefore below 2.1 u of it, for which there is room in a ray's reach and in
+/// the comparison of near with far depths, and 2.1 u |origin * inverse|, which the margin covers. Without fused
+/// operations the plane's own product adds u |plane * inverse|.
+///
+/// A component below 2^-25 of the largest is made that large. Within the depths at which the tree lies, at most
+/// `farthest` = extent + |origin|, that moves the ray by less than 2^-24 times that; the margin takes the double.
+template <class V>
+struct Slab {
+    V inverse;
+    V near_shift;
+    V far_shift;
+
+    /// steepness: the direction's largest component over this one, without signs; deviation: how far rays may pass
+    /// beside the origin along the axis.
+    HWY_INLINE Slab(V origin, V steepness, hn::Mask<hn::DFromV<V>> negative, float extent, V farthest, V deviation) {
+        const hn::DFromV<V> d;
+        inverse = hn::IfThenElse(negative, hn::Neg(steepness), steepness);
+        const V shift = hn::Neg(hn::Mul(origin, inverse));
+        V room = hn::Abs(shift);
+#if !HWY_NATIVE_FMA
+        room = hn::MulAdd(hn::Set(d, extent), steepness, room);
+#else
+        (void)extent;
+#endif
+        const V flat =
+            hn::IfThenElseZero(hn::Ge(steepness, hn::Set(d, 0x1p24F)), hn::Mul(farthest, hn::Set(d, 0x1p-22F)));
+        const V margin =
+            hn::MulAdd(hn::Add(flat, deviation), steepness, hn::MulAdd(room, hn::Set(d, 0x1p-22F), hn::Set(d, kTiny)));
+        near_shift = hn::Sub(shift, margin);
+        far_shift = hn::Add(shift, margin);
+    }
+};
+
+/// The depths from t_min to t_max, as TracedRay has them; largest: the direction's largest component, without sign.
+template <class V>
+struct DepthLimits {
+    V start;
+    V reach;
+    V sure_start;
+    V sure_end;
+
+    HWY_INLINE DepthLimits(V t_min, V t_max, V largest) {
+        const hn::DFromV<V> d;
+        const V tiny = hn::Set(d, kTiny);
+        const V below = hn::Set(d, 1 - 0x1p-21F);
+        const V from = hn::Mul(t_min, largest);
+        const V to = hn::Mul(t_max, largest);
+        start = hn::Sub(hn::Mul(from, below), tiny);
+        reach = hn::MulAdd(to, hn::Set(d, 1 + 0x1p-20F), tiny);
+        sure_start = hn::MulAdd(from, hn::Set(d, 1 + 0x1p-21F), tiny);
+        sure_end = hn::Sub(hn::Mul(to, below), tiny);
+    }
+};
+
+/// Sets single rays up, as many at once as fill any register.
+class RayBatch {
+ public:
+    static constexpr size_t kSize = 16;
+
+    /// kSize rays from `rays` on.
+    HWY_INLINE void set_up(const Ray* rays, float extent) {
+        for (size_t first = 0; first < kSize; first += kLanes) {
+            set_up_lanes(first, rays + first, extent);
+        }
+    }
+
+    HWY_INLINE void copy(size_t lane, TracedRay& ray) const {
+        static_assert(offsetof(TracedRay, place) == kQuads * 4 * sizeof(float));
+        const hn::CappedTag<float, 4> d;
+        auto* to = reinterpret_cast<float*>(&ray);
+        for (size_t quad = 0; quad < kQuads; ++quad) {
+            hn::Store(hn::Load(d, quads_[quad] + 4 * lane), d, to + 4 * quad);
+        }
+        ray.place = kNoPlace;
+    }
+
+ private:
+    static constexpr size_t kQuads = 8;
+    using D = hn::CappedTag<float, kSize>;
+    using V = hn::Vec<D>;
+    static constexpr size_t kLanes = hn::MaxLanes(D());
+
+    HWY_INLINE void set_up_lanes(size_t first, const Ray* rays, float extent) {
+        const D d;
+        const hn::RebindToUnsigned<D> du;
+        const RayColumns<V> given(d, rays);
+        const LaneAxes<V> axes(given.direction);
+        const V along = axes.pick(given.direction, 2);
+        const V largest = hn::Abs(along);
+        const V farthest = hn::Add(hn::Set(d, extent), largest_of(given.origin));
+        V inverse[3];
+        V near_shift[3];
+        V far_shift[3];
+        V near_planes[3];
+        V far_planes[3];
+        auto octant = hn::Zero(du);
+        for (uint32_t axis = 0; axis < 3; ++axis) {
+            const auto negative = hn::Lt(given.direction[axis], hn::Zero(d));
+            const V own = hn::Max(hn::Abs(given.direction[axis]), hn::Mul(largest, hn::Set(d, 0x1p-25F)));
+            const Slab<V> slab(given.origin[axis], hn::Div(largest, own), negative, extent, farthest, hn::Zero(d));
+            inverse[axis] = slab.inverse;
+            near_shift[axis] = slab.near_shift;
+            far_shift[axis] = slab.far_shift;
+            const auto negative_u = hn::RebindMask(du, negative);
+            octant = hn::Or(octant, hn::IfThenElseZero(negative_u, hn::Set(du, 1U << axis)));
+            const auto first_planes = hn::Set(du, axis * WideNode::kWidth);
+            const auto other_planes = hn::Set(du, (axis + 3) * WideNode::kWidth);
+            near_planes[axis] = hn::BitCast(d, hn::IfThenElse(negative_u, other_planes, first_planes));
+            far_planes[axis] = hn::BitCast(d, hn::IfThenElse(negative_u, first_planes, other_planes));
+        }
+        const V columns[3] = {hn::BitCast(d, hn::Set(du, 0)), hn::BitCast(d, hn::Set(du, kBlockSize)),
+                              hn::BitCast(d, hn::Set(du, 2 * kBlockSize))};
+        const V sx = hn::Div(axes.pick(given.direction, 0), along);
+        const V sy = hn::Div(axes.pick(given.direction, 1), along);
+        const V slant = hn::Mul(hn::Add(hn::Max(hn::Abs(sx), hn::Abs(sy)), hn::Set(d, 0x1p-64F)), hn::Set(d, 0x1p-24F));
+        const DepthLimits<V> limits(given.t_min, given.t_max, largest);
+        const auto store = [&](size_t quad, V a, V b, V c, V e) {
+            hn::StoreInterleaved4(a, b, c, e, d, quads_[quad] + 4 * first);
+        };
+        store(0, inverse[0], inverse[1], inverse[2], limits.start);
+        store(1, near_shift[0], near_shift[1], near_shift[2], limits.reach);
+        store(2, far_shift[0], far_shift[1], far_shift[2], hn::BitCast(d, octant));
+        store(3, near_planes[0], near_planes[1], near_planes[2], hn::CopySign(hn::Set(d, 1.0F), along));
+        store(4, far_planes[0], far_planes[1], far_planes[2], slant);
+        store(5, axes.pick(columns, 0), axes.pick(columns, 1), axes.pick(columns, 2), sx);
+        store(6, axes.pick(given.origin, 0), axes.pick(given.origin, 1), axes.pick(given.origin, 2), sy);
+        store(7, limits.sure_start, limits.sure_end, hn::Inf(d), hn::Mul(given.t_max, largest));
+    }
+
+    alignas(64) float quads_[kQuads][4 * kSize];
+};
+
+}  // namespace espalier::HWY_NAMESPACE
+HWY_AFTER_NAMESPACE();
+#endif
