@@ -17,11 +17,26 @@ HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
 namespace hn = hwy::HWY_NAMESPACE;
 
-inline void write_blocks(const TriangleSoup& soup, const uint32_t* triangles, size_t count, TriangleBlock* blocks) {
+/// The longest side of each triangle's box.
+template <class V>
+HWY_INLINE V longest_side(const V (&corners)[3][3]) {
+    V longest = hn::Zero(hn::DFromV<V>());
+    for (int axis = 0; axis < 3; ++axis) {
+        const V a = corners[0][axis];
+        const V b = corners[1][axis];
+        const V c = corners[2][axis];
+        longest = hn::Max(longest, hn::Sub(hn::Max(a, hn::Max(b, c)), hn::Min(a, hn::Min(b, c))));
+    }
+    return longest;
+}
+
+inline void write_blocks(const TriangleSoup& soup, SizeClasses classes, const uint32_t* triangles, size_t count,
+                         TriangleBlock* blocks) {
     const hn::CappedTag<float, kBlockSize> d;
     const hn::RebindToUnsigned<decltype(d)> du;
     const auto missing = hn::Set(du, kNoTriangle);
     for (size_t b = 0; b < count; ++b) {
+        auto longest = hn::Zero(d);
         for (size_t lane = 0; lane < kBlockSize; lane += hn::Lanes(d)) {
             const auto triangle = hn::LoadU(du, triangles + b * kBlockSize + lane);
             hn::Store(triangle, du, blocks[b].triangle + lane);
@@ -30,13 +45,16 @@ inline void write_blocks(const TriangleSoup& soup, const uint32_t* triangles, si
             hn::Store(hn::IfThenZeroElse(is_missing, triangle), du, any);  // lanes without a triangle read the first
             hn::Vec<decltype(d)> corners[3][3];
             load_corners(d, soup, any, corners);
+            const auto no_corner = hn::RebindMask(d, is_missing);
+            longest = hn::Max(longest, hn::IfThenZeroElse(no_corner, longest_side(corners)));
             for (int corner = 0; corner < 3; ++corner) {
                 for (int axis = 0; axis < 3; ++axis) {
-                    hn::Store(hn::IfThenElse(hn::RebindMask(d, is_missing), hn::NaN(d), corners[corner][axis]), d,
+                    hn::Store(hn::IfThenElse(no_corner, hn::NaN(d), corners[corner][axis]), d,
                               blocks[b].vertex[corner][axis] + lane);
                 }
             }
         }
+        blocks[b].triangle[0] += classes.of(hn::GetLane(hn::MaxOfLanes(d, longest))) * kMaxTriangles;
     }
 }
 

@@ -5,6 +5,7 @@
 
 #include "kdtree/node.h"
 #include "kdtree/references.h"
+#include "kdtree/size_class.h"
 #include "kdtree/subtree_output.h"
 #include "kdtree/tree.h"
 
@@ -111,7 +112,8 @@ struct BuildKernels {
     /// Appends everything below a node to the output. Throws BuildCancelled.
     void (*build_subtree)(const SubtreeInput& input, const OpenNode& node, SubtreeOutput& output);
     /// Fills blocks from kBlockSize face indices each.
-    void (*write_blocks)(const TriangleSoup& soup, const uint32_t* triangles, size_t count, TriangleBlock* blocks);
+    void (*write_blocks)(const TriangleSoup& soup, SizeClasses classes, const uint32_t* triangles, size_t count,
+                         TriangleBlock* blocks);
 };
 
 /// The kernels for the instruction set in use (see simd_target.h).

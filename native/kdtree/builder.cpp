@@ -16,8 +16,6 @@
 namespace espalier {
 namespace {
 
-constexpr uint32_t kMaxTriangles = 1U << 28;
-
 class Stopwatch {
  public:
     /// Milliseconds since the last lap.

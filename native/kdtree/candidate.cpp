@@ -16,7 +16,7 @@ bool hit_place(const Ray& ray, const TriangleBlock* blocks, uint32_t place, Exac
     for (int k = 0; k < 3; ++k) {
         corner[k] = {block.vertex[k][0][lane], block.vertex[k][1][lane], block.vertex[k][2][lane]};
     }
-    hit.triangle = static_cast<int32_t>(block.triangle[lane]);
+    hit.triangle = static_cast<int32_t>(triangle_at(blocks, place));
     return hit_exactly(ray.origin, ray.direction, corner, hit);
 }
 

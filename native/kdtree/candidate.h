@@ -29,7 +29,7 @@ Hit finish_exactly(const Ray& ray, const TriangleBlock* blocks, uint32_t place);
 inline Hit missed(const Ray& ray) { return {ray.t_max, 0, 0, -1}; }
 
 inline uint32_t triangle_at(const TriangleBlock* blocks, uint32_t place) {
-    return blocks[place / kBlockSize].triangle[place % kBlockSize];
+    return blocks[place / kBlockSize].triangle[place % kBlockSize] % kMaxTriangles;
 }
 
 }  // namespace espalier

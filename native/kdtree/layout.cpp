@@ -192,6 +192,7 @@ void build_layout(const TriangleSoup& soup, std::span<const Box3f> boxes, std::s
     find_runs(tree, 0, nodes, run_length(nodes), runs);
 
     const Collapse collapse(tree.nodes.span(), boxes);
+    const SizeClasses classes(tree.bounds);
     const size_t most_wide_nodes = most_nodes(nodes, blocks);
     std::vector<WideNodes> made(static_cast<size_t>(threads));
     const size_t block_tasks = (blocks + kBlocksPerTask - 1) / kBlocksPerTask;
@@ -210,7 +211,8 @@ void build_layout(const TriangleSoup& soup, std::span<const Box3f> boxes, std::s
         }
         const size_t begin = (i - runs.size()) * kBlocksPerTask;
         const size_t count = std::min(kBlocksPerTask, blocks - begin);
-        build_kernels().write_blocks(soup, triangles.data() + begin * kBlockSize, count, tree.blocks.data() + begin);
+        build_kernels().write_blocks(soup, classes, triangles.data() + begin * kBlockSize, count,
+                                     tree.blocks.data() + begin);
     });
 
     // The wide nodes above the runs, whose number is small. A tree that is one run has none.

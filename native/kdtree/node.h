@@ -10,6 +10,9 @@ namespace espalier {
 /// Triangles are tested this many at a time, whatever the instruction set.
 constexpr uint32_t kBlockSize = 8;
 
+/// What a face's index may count to.
+constexpr uint32_t kMaxTriangles = 1U << 28;
+
 /// Subtrees that may wait to be opened.
 constexpr uint32_t kMaxUnopened = 1U << 20;
 
@@ -46,7 +49,8 @@ static_assert(sizeof(KdNode) == 8);
 /// Eight triangles in SIMD order. Lanes past the leaf's last triangle hold NaN corners and kNoTriangle.
 struct alignas(32) TriangleBlock {
     float vertex[3][3][kBlockSize];  ///< [corner][axis][lane]
-    uint32_t triangle[kBlockSize];   ///< index of the face in the mesh as it was given
+    uint32_t triangle[kBlockSize];   ///< index of the face in the mesh as it was given; kMaxTriangles times the block's
+                                     ///< size class on top of the first
 };
 static_assert(sizeof(TriangleBlock) == 320);
 

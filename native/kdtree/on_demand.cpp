@@ -41,6 +41,7 @@ void OnDemand::make_references(Tree& tree) {
     top_.make_references();
     tree.report.rejected_faces = top_.rejected();
     tree.bounds = top_.nodes()[0].node.cell;
+    classes_ = SizeClasses(tree.bounds);
 }
 
 void OnDemand::split_top(Tree& tree) {
@@ -258,7 +259,7 @@ uint32_t OnDemand::append(WideNodes& wide, std::span<const uint32_t> triangles) 
     if (first_block + blocks > most_blocks_) {
         throw std::length_error("the tree needs more triangle blocks than it has room for");
     }
-    kernels_.write_blocks(soup_, triangles.data(), blocks, blocks_ + first_block);
+    kernels_.write_blocks(soup_, classes_, triangles.data(), blocks, blocks_ + first_block);
     const uint32_t first = add_nodes(wide.count());
     for (uint32_t i = 0; i < wide.count(); ++i) {
         WideNode& node = nodes_[first + i];

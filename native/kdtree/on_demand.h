@@ -76,6 +76,7 @@ class OnDemand {
     std::atomic<uint32_t> opened_{0};
     uint32_t opened_before_ = 0;  ///< rays started
 
+    SizeClasses classes_;
     WideNode* nodes_ = nullptr;  ///< the tree's
     TriangleBlock* blocks_ = nullptr;
     size_t most_blocks_;

@@ -38,7 +38,7 @@ class Packet {
         : nodes_(tree.wide_nodes.data()),
           blocks_(tree.blocks.data()),
           on_demand_(tree.on_demand.get()),
-          extent_(extent_of(tree)) {}
+          extent_(extent_of(tree.bounds)) {}
 
     /// Sets the rays up if they make a packet.
     HWY_INLINE bool gather(const Ray* rays) {

@@ -14,6 +14,7 @@
 #include <cstdint>
 
 #include "kdtree/node.h"
+#include "kdtree/size_class.h"
 #include "kdtree/traced_ray-inl.h"
 #include "kdtree/traversal.h"
 
@@ -131,12 +132,30 @@ class RayBatch {
  public:
     static constexpr size_t kSize = 16;
 
-    /// kSize rays from `rays` on.
-    HWY_INLINE void set_up(const Ray* rays, float extent) {
-        for (size_t first = 0; first < kSize; first += kLanes) {
-            set_up_lanes(first, rays + first, extent);
+    /// bounds: of the tree.
+    explicit RayBatch(const Box3f& bounds) : bounds_(bounds), extent_(extent_of(bounds)) {
+        const SizeClasses classes(bounds);
+        for (uint32_t c = 0; c < SizeClasses::kCount; ++c) {
+            sizes_[c] = classes.limit(c);
         }
     }
+
+    /// kSize rays from `rays` on.
+    HWY_INLINE void set_up(const Ray* rays) {
+        V farthest_slant = hn::Zero(D());
+        for (size_t first = 0; first < kSize; first += kLanes) {
+            farthest_slant = hn::Max(farthest_slant, set_up_lanes(first, rays + first));
+        }
+        if (const float lean = hn::GetLane(hn::MaxOfLanes(D(), farthest_slant)); lean > lean_) {
+            lean_ = lean;
+            set_least_inside();
+        }
+    }
+
+    /// By size class of a block: no edge function of a triangle that a ray hits is less inside, of any ray since the
+    /// last reset.
+    const float* least_inside() const { return least_inside_; }
+    void reset() { lean_ = -1; }
 
     HWY_INLINE void copy(size_t lane, TracedRay& ray) const {
         static_assert(offsetof(TracedRay, place) == kQuads * 4 * sizeof(float));
@@ -146,6 +165,7 @@ class RayBatch {
             hn::Store(hn::Load(d, quads_[quad] + 4 * lane), d, to + 4 * quad);
         }
         ray.place = kNoPlace;
+        ray.triangle = kNoTriangle;
     }
 
  private:
@@ -154,14 +174,24 @@ class RayBatch {
     using V = hn::Vec<D>;
     static constexpr size_t kLanes = hn::MaxLanes(D());
 
-    HWY_INLINE void set_up_lanes(size_t first, const Ray* rays, float extent) {
+    /// What Sheared::minus_edge_error comes to for the largest triangles of each size that a ray can hit, and less.
+    /// EXACTNESS.md, 8.
+    void set_least_inside() {
+        for (uint32_t c = 0; c < SizeClasses::kCount; ++c) {
+            const float s = 4.0625F * sizes_[c] + 16 * lean_;
+            least_inside_[c] = -s * (3.3125F * 0x1p-24F * s + 10.625F * lean_) - 2 * kTiny;
+        }
+    }
+
+    /// Returns how far a rounding of the farthest corner's z moves its x and y.
+    HWY_INLINE V set_up_lanes(size_t first, const Ray* rays) {
         const D d;
         const hn::RebindToUnsigned<D> du;
         const RayColumns<V> given(d, rays);
         const LaneAxes<V> axes(given.direction);
         const V along = axes.pick(given.direction, 2);
         const V largest = hn::Abs(along);
-        const V farthest = hn::Add(hn::Set(d, extent), largest_of(given.origin));
+        const V farthest = hn::Add(hn::Set(d, extent_), largest_of(given.origin));
         V inverse[3];
         V near_shift[3];
         V far_shift[3];
@@ -171,7 +201,7 @@ class RayBatch {
         for (uint32_t axis = 0; axis < 3; ++axis) {
             const auto negative = hn::Lt(given.direction[axis], hn::Zero(d));
             const V own = hn::Max(hn::Abs(given.direction[axis]), hn::Mul(largest, hn::Set(d, 0x1p-25F)));
-            const Slab<V> slab(given.origin[axis], hn::Div(largest, own), negative, extent, farthest, hn::Zero(d));
+            const Slab<V> slab(given.origin[axis], hn::Div(largest, own), negative, extent_, farthest, hn::Zero(d));
             inverse[axis] = slab.inverse;
             near_shift[axis] = slab.near_shift;
             far_shift[axis] = slab.far_shift;
@@ -187,6 +217,11 @@ class RayBatch {
         const V sx = hn::Div(axes.pick(given.direction, 0), along);
         const V sy = hn::Div(axes.pick(given.direction, 1), along);
         const V slant = hn::Mul(hn::Add(hn::Max(hn::Abs(sx), hn::Abs(sy)), hn::Set(d, 0x1p-64F)), hn::Set(d, 0x1p-24F));
+        V farthest_z = hn::Zero(d);
+        for (int axis = 0; axis < 3; ++axis) {
+            farthest_z = hn::Max(farthest_z, largest_of(hn::Sub(hn::Set(d, bounds_.lower[axis]), given.origin[axis]),
+                                                        hn::Sub(hn::Set(d, bounds_.upper[axis]), given.origin[axis])));
+        }
         const DepthLimits<V> limits(given.t_min, given.t_max, largest);
         const auto store = [&](size_t quad, V a, V b, V c, V e) {
             hn::StoreInterleaved4(a, b, c, e, d, quads_[quad] + 4 * first);
@@ -199,8 +234,14 @@ class RayBatch {
         store(5, axes.pick(columns, 0), axes.pick(columns, 1), axes.pick(columns, 2), sx);
         store(6, axes.pick(given.origin, 0), axes.pick(given.origin, 1), axes.pick(given.origin, 2), sy);
         store(7, limits.sure_start, limits.sure_end, hn::Inf(d), hn::Mul(given.t_max, largest));
+        return hn::Mul(slant, farthest_z);
     }
 
+    Box3f bounds_;
+    float extent_;  ///< their largest coordinate
+    float lean_ = -1;
+    float sizes_[SizeClasses::kCount];
+    float least_inside_[SizeClasses::kCount];
     alignas(64) float quads_[kQuads][4 * kSize];
 };
 

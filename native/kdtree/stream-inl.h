@@ -121,13 +121,14 @@ class Stream {
         : nodes_(tree.wide_nodes.data()),
           blocks_(tree.blocks.data()),
           on_demand_(tree.on_demand.get()),
-          extent_(extent_of(tree)),
-          rays_(rays) {}
+          rays_(rays),
+          batch_(tree.bounds) {}
 
     /// Traces rays, batches of them from these numbers on, and calls done(ray) for each when its way has ended.
     template <class Done>
     HWY_INLINE void run(std::span<const uint32_t> batches, const Done& done) {
         batches_ = batches;
+        batch_.reset();
         Lists lists;
         for (uint32_t slot = 0; slot < kInFlight; ++slot) {
             begin(ray_[slot], lists);
@@ -152,7 +153,8 @@ class Stream {
                 const uint32_t further = leaf % WideNode::kMaxLeafBlocks;  // blocks behind the first
                 const uint32_t block = WideNode::first_block(leaf);
                 Verdict verdict;
-                const uint32_t possible = test_blocks<kExact>(ray, blocks_ + block, further == 0, verdict);
+                const uint32_t possible =
+                    test_blocks<kExact>(ray, blocks_ + block, further == 0, batch_.least_inside(), verdict);
                 if (possible != 0 && take(ray, verdict, possible, block)) {
                     if constexpr (kAnyHit) {
                         end_list_[lists.at_end++] = &ray;
@@ -208,11 +210,11 @@ class Stream {
         const std::span<const Ray> rays = rays_.subspan(next_, std::min(RayBatch::kSize, rays_.size() - next_));
         end_ = next_ + static_cast<uint32_t>(rays.size());
         if (rays.size() == RayBatch::kSize) {
-            batch_.set_up(rays.data(), extent_);
+            batch_.set_up(rays.data());
         } else {
             Ray filled_up[RayBatch::kSize];
             std::fill(std::copy(rays.begin(), rays.end(), filled_up), std::end(filled_up), rays.front());
-            batch_.set_up(filled_up, extent_);
+            batch_.set_up(filled_up);
         }
         return true;
     }
@@ -251,13 +253,16 @@ class Stream {
                 !kExact || ((verdict.certain >> lane & 1U) != 0 && lower >= ray.sure_start && upper <= ray.sure_end);
             if (is_sure && upper < ray.lower) {
                 ray.place = block * kBlockSize + lane;
+                ray.triangle = triangle_at(blocks_, ray.place);
                 ray.shorten(lower, upper);
                 taken = true;
                 if (kAnyHit) {
                     return true;
                 }
-            } else {
-                open |= lanes & -lanes;
+            } else if (kExact) {
+                // Mostly the triangle that the ray has hit, in another leaf.
+                const bool is_known = triangle_at(blocks_, block * kBlockSize + lane) == ray.triangle;
+                open |= is_known ? 0 : lanes & -lanes;
             }
         }
         if (kExact && open != 0) [[unlikely]] {
@@ -272,13 +277,13 @@ class Stream {
         for (; open != 0; open &= open - 1) {
             const auto lane = static_cast<uint32_t>(std::countr_zero(open));
             const uint32_t place = block * kBlockSize + lane;
-            if (verdict.lower[lane] > ray.reach ||
-                (ray.place != kNoPlace && triangle_at(blocks_, ray.place) == triangle_at(blocks_, place))) {
+            if (verdict.lower[lane] > ray.reach) {
                 continue;
             }
             Nearest nearest{ray.place, ray.lower, ray.upper};
             if (take_exactly(rays_[ray.number], blocks_, place, nearest)) {
                 ray.place = place;
+                ray.triangle = triangle_at(blocks_, place);
                 ray.shorten(nearest.lower, nearest.upper);
                 taken = true;
             }
@@ -289,7 +294,6 @@ class Stream {
     const WideNode* nodes_;
     const TriangleBlock* blocks_;
     OnDemand* on_demand_;
-    float extent_;
     std::span<const Ray> rays_;
     std::span<const uint32_t> batches_;  ///< those not yet set up, by the numbers of their first rays
     RayBatch batch_;

@@ -110,17 +110,17 @@ struct Axes {
     }
 };
 
-/// The largest coordinate of the tree, of either sign.
-inline float extent_of(const Tree& tree) {
+/// The largest coordinate of a box, of either sign.
+inline float extent_of(const Box3f& bounds) {
     float extent = 0;
     for (int axis = 0; axis < 3; ++axis) {
-        extent = std::max({extent, std::abs(tree.bounds.lower[axis]), std::abs(tree.bounds.upper[axis])});
+        extent = std::max({extent, std::abs(bounds.lower[axis]), std::abs(bounds.upper[axis])});
     }
     return extent;
 }
 
 /// Distances are depths: measured along the direction's largest component, z, so depth = t |direction[z]|. They neither
-/// overflow nor underflow where t would. RayBatch fills rays in, four words at a time, but for `place`.
+/// overflow nor underflow where t would. RayBatch fills rays in, four words at a time, but for the last two.
 struct alignas(16) TracedRay {
     // Box test: a plane's depth is plane * inverse + shift, see Slab.
     float inverse[3];
@@ -145,6 +145,7 @@ struct alignas(16) TracedRay {
     float lower;  ///< its true depth lies between these two
     float upper;
     uint32_t place;
+    uint32_t triangle;
 
     /// Takes in that a hit's depth lies between these two.
     void shorten(float from, float to) {

@@ -12,7 +12,7 @@
 
 #include <hwy/highway.h>
 
-#include <bit>
+#include <algorithm>
 #include <cstdint>
 
 #include "kdtree/candidate.h"
@@ -53,6 +53,15 @@ class BlockLoader {
     const float* first_;
     [[maybe_unused]] const float* second_;
 };
+
+/// That of the larger of the blocks that a step tests.
+HWY_INLINE uint32_t size_class(const TriangleBlock* block, bool is_single) {
+    uint32_t triangle = block->triangle[0];
+    if constexpr (kBlocksPerStep == 2) {
+        triangle = std::min(triangle, block[is_single ? 0 : 1].triangle[0]);
+    }
+    return triangle / kMaxTriangles;
+}
 
 /// One ray for all lanes, or one for each.
 template <class V>
@@ -147,7 +156,8 @@ HWY_INLINE DepthRange<V> depth_range(const V (&side)[3], V bound, V mz, V z0, V 
 /// operations only leave roundings out. Underflow adds less than kTiny: a product's is below 2^-149, and a coordinate's
 /// counts by at most 2^-149 s, which u s^2 outweighs from s = 2^-125 on.
 template <bool kExact>
-HWY_INLINE uint32_t test_blocks(const TracedRay& ray, const TriangleBlock* block, bool is_single, Verdict& verdict) {
+HWY_INLINE uint32_t test_blocks(const TracedRay& ray, const TriangleBlock* block, bool is_single,
+                                const float* least_inside_of_class, Verdict& verdict) {
     const hn::CappedTag<float, kBlocksPerStep * kBlockSize> d;
     constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<float, kBlocksPerStep * kBlockSize>());
     using V = hn::Vec<decltype(d)>;
@@ -161,21 +171,22 @@ HWY_INLINE uint32_t test_blocks(const TracedRay& ray, const TriangleBlock* block
                                 hn::Set(d, ray.sx),
                                 hn::Set(d, ray.sy),
                                 hn::Set(d, ray.slant)};
+    const V least_inside = kExact ? hn::Set(d, least_inside_of_class[size_class(block, is_single)]) : hn::Zero(d);
     uint32_t possible = 0;
     for (size_t first = 0; first < kBlockSize; first += kLanes) {
         const Sheared<V> seen(sheared,
                               [&](size_t k, uint32_t axis) { return load(k * 3 * kBlockSize + first + axis); });
         const V inwards = depth_inside(seen.side);  // lanes without a triangle are NaN and fail
-        V below = hn::Zero(d);
+        if (hn::AllFalse(d, hn::Ge(inwards, least_inside))) {
+            continue;
+        }
+        V below = least_inside;
         V mz = below;
         if constexpr (kExact) {
             mz = largest_of(seen.z);
             below = seen.minus_edge_error(sheared.slant, mz);
         }
         const auto inside = hn::Ge(inwards, below);
-        if (hn::AllFalse(d, inside)) {
-            continue;
-        }
         const V bound = hn::Neg(below);
         const V(&z)[3] = seen.z;
         const DepthRange<V> depth =

@@ -16,7 +16,6 @@ namespace espalier {
 namespace {
 
 constexpr size_t kChunk = 16384;
-constexpr uint64_t kMaxTriangles = std::numeric_limits<int32_t>::max();
 constexpr uint64_t kMaxVertices = std::numeric_limits<uint32_t>::max();
 
 /// How many vertices or triangles make a median: of a mesh or the scene at most, of a placement at least.
@@ -150,7 +149,7 @@ void Scene::place(std::span<const MeshInput> meshes, std::span<const Placement> 
         triangles += mesh.triangles.size() / 3;
         if (triangles > kMaxTriangles || vertices > kMaxVertices) {
             throw std::invalid_argument("the placed scene has more than " + std::to_string(kMaxTriangles) +
-                                        " triangles or 2^32 vertices, more than a 32-bit index can name");
+                                        " triangles or 2^32 vertices, more than an index can name");
         }
     }
     first_triangle_.push_back(static_cast<uint32_t>(triangles));

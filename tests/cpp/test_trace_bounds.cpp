@@ -30,6 +30,7 @@ struct DepthsResult {
 };
 struct FilterResult {
     float side[3], bound;
+    float least_inside;  ///< what is no further inside is ruled out before its bound is known
     bool possible, certain;
     float lower, upper;
 };
@@ -56,11 +57,10 @@ HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
 namespace hn = hwy::HWY_NAMESPACE;
 
-inline TracedRay set_up(const Ray& ray, float extent) {
+inline TracedRay set_up(const Ray& ray, RayBatch& batch) {
     Ray rays[RayBatch::kSize];
     std::fill(std::begin(rays), std::end(rays), ray);
-    RayBatch batch;
-    batch.set_up(rays, extent);
+    batch.set_up(rays);
     TracedRay traced;
     batch.copy(0, traced);
     return traced;
@@ -68,7 +68,8 @@ inline TracedRay set_up(const Ray& ray, float extent) {
 
 inline DepthsResult depths_of(const Ray& ray, float extent, const Box3f& box) {
     const hn::CappedTag<float, 4> d;
-    const TracedRay traced = set_up(ray, extent);
+    RayBatch batch({{-extent, -extent, -extent}, {extent, extent, extent}});
+    const TracedRay traced = set_up(ray, batch);
     DepthsResult result;
     result.entry = traced.start;
     result.exit = traced.reach;
@@ -100,9 +101,21 @@ inline TriangleBlock block_of(const Vec3f (&corner)[3]) {
     return block;
 }
 
-inline FilterResult filter(const Ray& ray, const Vec3f (&corner)[3]) {
-    const TriangleBlock block = block_of(corner);
-    const TracedRay traced = set_up(ray, kMaxCoordinate);
+inline FilterResult filter(const Ray& ray, const Vec3f (&corner)[3], const Box3f& bounds) {
+    TriangleBlock blocks[2] = {block_of(corner), block_of(corner)};
+    Box3f box;
+    for (const Vec3f& v : corner) {
+        box.extend(v);
+    }
+    const Vec3f size = box.size();
+    const uint32_t size_class = SizeClasses(bounds).of(std::max({size.x, size.y, size.z}));
+    // Where a step takes two blocks, the first looks as if it held the smallest triangles.
+    blocks[0].triangle[0] = (SizeClasses::kCount - 1) * kMaxTriangles;
+    blocks[1].triangle[0] = size_class * kMaxTriangles;
+    const TriangleBlock& block = blocks[1];
+    RayBatch batch(bounds);
+    set_up({bounds.lower, 0, {1, 0, 0}, 0}, batch);  // rays before it need no room
+    const TracedRay traced = set_up(ray, batch);
     const hn::CappedTag<float, kBlockSize> d;
     using V = hn::Vec<decltype(d)>;
     const ShearedRay<V> own{traced.x,
@@ -117,13 +130,16 @@ inline FilterResult filter(const Ray& ray, const Vec3f (&corner)[3]) {
     const Sheared<V> seen(own, [&](size_t k, uint32_t axis) { return hn::Load(d, block.vertex[k][0] + axis); });
     const V bound = hn::Neg(seen.minus_edge_error(own.slant, largest_of(seen.z)));
     Verdict verdict{};
-    const uint32_t possible = test_blocks<true>(traced, &block, true, verdict);
+    constexpr bool kTwo = kBlocksPerStep == 2;
+    constexpr uint32_t kLane = kTwo ? kBlockSize : 0;
+    const uint32_t possible = test_blocks<true>(traced, blocks + (kTwo ? 0 : 1), !kTwo, batch.least_inside(), verdict);
     return {{hn::GetLane(seen.side[0]), hn::GetLane(seen.side[1]), hn::GetLane(seen.side[2])},
             hn::GetLane(bound),
-            (possible & 1U) != 0,
-            (possible & verdict.certain & 1U) != 0,
-            verdict.lower[0],
-            verdict.upper[0]};
+            batch.least_inside()[size_class],
+            (possible >> kLane & 1U) != 0,
+            (possible >> kLane & verdict.certain >> kLane & 1U) != 0,
+            verdict.lower[kLane],
+            verdict.upper[kLane]};
 }
 
 /// As Packet sets it up, for a packet of this ray and others.
@@ -181,7 +197,7 @@ namespace {
 struct Code {
     const char* name;
     DepthsResult (*depths_of)(const Ray&, float, const Box3f&);
-    FilterResult (*filter)(const Ray&, const Vec3f (&)[3]);
+    FilterResult (*filter)(const Ray&, const Vec3f (&)[3], const Box3f&);
     ViewResult (*look)(const Ray&, const Vec3f (&)[3], const SeenFromFocus&);
     FinishResult (*finish)(const Ray&, const Vec3f (&)[3]);
 };
@@ -376,16 +392,26 @@ TEST_P(TraceBounds, OfTheBoxTestLetNoPointSlip) {
 TEST_P(TraceBounds, OfTheFloatFilterHoldWhatItDoesNotDecide) {
     Random random(5);
     Share edges(named("edge functions, 8"));
+    Share outsides(named("bound of a hit by size class, 8"));
     Share depths(named("depth of a hit, 8"));
     uint32_t lost = 0;
     uint32_t invented = 0;
     uint32_t undecided = 0;
     uint32_t decided = 0;
-    for_each_aimed(random, 5000, [&](const Aimed& aimed, int) {
-        const FilterResult result = GetParam().filter(aimed.ray, aimed.corner);
+    for_each_aimed(random, 5000, [&](const Aimed& aimed, int high) {
+        // As part of something larger, up to where every class is smaller than the triangle.
+        const Vec3f beside = random.point(high, high) * std::ldexp(1.0F, -static_cast<int>(random.below(20)));
+        Box3f bounds{aimed.corner[0], aimed.corner[0]};
+        for (const Vec3f& v : {aimed.corner[1], aimed.corner[2], aimed.corner[0] + beside}) {
+            bounds.extend(v);
+        }
+        const FilterResult result = GetParam().filter(aimed.ray, aimed.corner, bounds);
         const ExactTriangle truth(aimed.ray, aimed.corner);
         const Exact along = aimed.ray.direction[largest_axis(aimed.ray.direction)];
         add_edges(edges, result.side, truth, along, result.bound);
+        if (truth.is_hit()) {
+            outsides.add(result.bound, -result.least_inside);
+        }
         const bool counts = truth.is_hit() && truth.t() >= 0;
         lost += counts && !result.possible ? 1U : 0U;
         invented += result.certain && !truth.is_hit() ? 1U : 0U;
@@ -402,6 +428,8 @@ TEST_P(TraceBounds, OfTheFloatFilterHoldWhatItDoesNotDecide) {
     EXPECT_GT(decided, 1000U);
     EXPECT_LT(edges.largest(), 1);
     EXPECT_GT(edges.largest(), 0.1);
+    EXPECT_LT(outsides.largest(), 1);
+    EXPECT_GT(outsides.largest(), 0.1);
     EXPECT_LT(depths.largest(), 1);
     EXPECT_GT(depths.largest(), 0.03);
 }

@@ -5,6 +5,8 @@
 #include <functional>
 #include <thread>
 
+#include "kdtree/candidate.h"
+#include "kdtree/size_class.h"
 #include "kdtree/traversal.h"
 #include "meshes.h"
 
@@ -99,16 +101,43 @@ std::vector<Vec3d> crossings(const Vec3d (&corner)[3], const std::vector<KdNode>
     return points;
 }
 
+std::vector<uint32_t> faces_of(const TriangleBlock& block) {
+    std::vector<uint32_t> faces;
+    for (uint32_t lane = 0; lane < kBlockSize; ++lane) {
+        if (block.triangle[lane] != kNoTriangle) {
+            faces.push_back(triangle_at(&block, lane));
+        }
+    }
+    return faces;
+}
+
+/// The size class of each block is that of its largest triangle, none of whose sides is longer than the class allows.
+void expect_size_classes(const Mesh& mesh, const Tree& tree) {
+    const SizeClasses classes(tree.bounds);
+    for (const TriangleBlock& block : tree.blocks.span()) {
+        float longest = 0;
+        for (const uint32_t face : faces_of(block)) {
+            Box3f box;
+            for (uint32_t k = 0; k < 3; ++k) {
+                box.extend(mesh.soup().vertex(face, k));
+            }
+            const Vec3f size = box.size();
+            longest = std::max({longest, size.x, size.y, size.z});
+        }
+        const uint32_t size_class = block.triangle[0] / kMaxTriangles;
+        EXPECT_EQ(size_class, classes.of(longest));
+        EXPECT_LT(longest, classes.limit(size_class));
+    }
+}
+
 /// Points of every triangle lie in a box that holds the triangle: no clipping may cut anything away.
 void expect_everything_covered(const Mesh& mesh, const Tree& tree) {
     const TriangleSoup soup = mesh.soup();
     std::vector<std::vector<Box3f>> boxes(soup.size());
     for_each_leaf(tree, [&](uint32_t first, uint32_t blocks, const Box3f& box) {
         for (uint32_t b = first; b < first + blocks; ++b) {
-            for (const uint32_t triangle : tree.blocks[b].triangle) {
-                if (triangle != kNoTriangle) {
-                    boxes[triangle].push_back(box);
-                }
+            for (const uint32_t face : faces_of(tree.blocks[b])) {
+                boxes[face].push_back(box);
             }
         }
     });
@@ -158,6 +187,7 @@ TEST(Tree, IsWellFormedAndCoversEveryTriangle) {
             const Tree tree = build(mesh.soup(), {quality, 1});
             expect_well_formed(tree);
             expect_everything_covered(mesh, tree);
+            expect_size_classes(mesh, tree);
         }
     }
 }
@@ -230,10 +260,8 @@ TEST(Tree, SetsBadFacesAsideAndCountsThem) {
         std::vector<bool> held(mesh.triangles.size() / 3);
         for_each_leaf(tree, [&](uint32_t first, uint32_t blocks, const Box3f&) {
             for (uint32_t b = first; b < first + blocks; ++b) {
-                for (const uint32_t triangle : tree.blocks[b].triangle) {
-                    if (triangle != kNoTriangle) {
-                        held[triangle] = true;
-                    }
+                for (const uint32_t face : faces_of(tree.blocks[b])) {
+                    held[face] = true;
                 }
             }
         });
