@@ -10,7 +10,7 @@ namespace espalier {
 /// Triangles are tested this many at a time, whatever the instruction set.
 constexpr uint32_t kBlockSize = 8;
 
-/// What a face's index may count to.
+/// Indices of faces lie below this.
 constexpr uint32_t kMaxTriangles = 1U << 28;
 
 /// Subtrees that may wait to be opened.

@@ -12,6 +12,7 @@
 #include <hwy/highway.h>
 
 #include <cstdint>
+#include <limits>
 
 #include "kdtree/node.h"
 #include "kdtree/size_class.h"
@@ -142,12 +143,12 @@ class RayBatch {
 
     /// kSize rays from `rays` on.
     HWY_INLINE void set_up(const Ray* rays) {
-        V farthest_slant = hn::Zero(D());
+        V lean = hn::Zero(D());
         for (size_t first = 0; first < kSize; first += kLanes) {
-            farthest_slant = hn::Max(farthest_slant, set_up_lanes(first, rays + first));
+            lean = hn::Max(lean, set_up_lanes(first, rays + first));
         }
-        if (const float lean = hn::GetLane(hn::MaxOfLanes(D(), farthest_slant)); lean > lean_) {
-            lean_ = lean;
+        if (const float most = hn::GetLane(hn::MaxOfLanes(D(), lean)); most > lean_) {
+            lean_ = most;
             set_least_inside();
         }
     }
@@ -183,7 +184,7 @@ class RayBatch {
         }
     }
 
-    /// Returns how far a rounding of the farthest corner's z moves its x and y.
+    /// Returns how far a rounding of the farthest z that a corner may have moves its x and y.
     HWY_INLINE V set_up_lanes(size_t first, const Ray* rays) {
         const D d;
         const hn::RebindToUnsigned<D> du;
@@ -234,14 +235,16 @@ class RayBatch {
         store(5, axes.pick(columns, 0), axes.pick(columns, 1), axes.pick(columns, 2), sx);
         store(6, axes.pick(given.origin, 0), axes.pick(given.origin, 1), axes.pick(given.origin, 2), sy);
         store(7, limits.sure_start, limits.sure_end, hn::Inf(d), hn::Mul(given.t_max, largest));
-        return hn::Mul(slant, farthest_z);
+        // A ray that is no ray must not take hits from those beside it.
+        const V lean = hn::Mul(slant, farthest_z);
+        return hn::IfThenElse(hn::Le(lean, hn::Set(d, std::numeric_limits<float>::max())), lean, hn::Inf(d));
     }
 
     Box3f bounds_;
     float extent_;  ///< their largest coordinate
     float lean_ = -1;
     float sizes_[SizeClasses::kCount];
-    float least_inside_[SizeClasses::kCount];
+    float least_inside_[SizeClasses::kCount] = {};
     alignas(64) float quads_[kQuads][4 * kSize];
 };
 

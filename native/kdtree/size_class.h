@@ -9,8 +9,9 @@
 
 namespace espalier {
 
-/// How large triangles are at most, in sixteen powers of two below the size of all of them together: of class c, no
-/// side of a triangle's box is longer than limit(c). It tells rays how exactly they have to look.
+/// How large triangles are at most, in sixteen powers of two: of class c, no side of a triangle's box is as long as
+/// limit(c). limit(0) is the least power of two above the sides of all triangles' bounds, and no limit lies below
+/// 2^-125. It tells rays how exactly they have to look.
 class SizeClasses {
  public:
     static constexpr uint32_t kCount = 16;
@@ -24,6 +25,7 @@ class SizeClasses {
         }
     }
 
+    /// longest_side: of a triangle within the bounds.
     uint32_t of(float longest_side) const { return std::min(top_ - exponent(longest_side), kCount - 1); }
     float limit(uint32_t size_class) const { return std::bit_cast<float>((top_ + 1 - size_class) << kMantissaBits); }
 

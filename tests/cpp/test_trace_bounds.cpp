@@ -58,11 +58,14 @@ namespace espalier::HWY_NAMESPACE {
 namespace hn = hwy::HWY_NAMESPACE;
 
 inline TracedRay set_up(const Ray& ray, RayBatch& batch) {
+    // Among rays that need no room.
     Ray rays[RayBatch::kSize];
-    std::fill(std::begin(rays), std::end(rays), ray);
+    std::fill(std::begin(rays), std::end(rays), Ray{{}, 0, {1, 0, 0}, 0});
+    const size_t lane = std::bit_cast<uint32_t>(ray.origin.x) / 3 % RayBatch::kSize;
+    rays[lane] = ray;
     batch.set_up(rays);
     TracedRay traced;
-    batch.copy(0, traced);
+    batch.copy(lane, traced);
     return traced;
 }
 
@@ -114,7 +117,7 @@ inline FilterResult filter(const Ray& ray, const Vec3f (&corner)[3], const Box3f
     blocks[1].triangle[0] = size_class * kMaxTriangles;
     const TriangleBlock& block = blocks[1];
     RayBatch batch(bounds);
-    set_up({bounds.lower, 0, {1, 0, 0}, 0}, batch);  // rays before it need no room
+    set_up({bounds.lower, 0, {1, 0, 0}, 0}, batch);  // as do those before it
     const TracedRay traced = set_up(ray, batch);
     const hn::CappedTag<float, kBlockSize> d;
     using V = hn::Vec<decltype(d)>;
@@ -399,7 +402,7 @@ TEST_P(TraceBounds, OfTheFloatFilterHoldWhatItDoesNotDecide) {
     uint32_t undecided = 0;
     uint32_t decided = 0;
     for_each_aimed(random, 5000, [&](const Aimed& aimed, int high) {
-        // As part of something larger, up to where every class is smaller than the triangle.
+        // As part of something larger, up to where all classes are for larger triangles.
         const Vec3f beside = random.point(high, high) * std::ldexp(1.0F, -static_cast<int>(random.below(20)));
         Box3f bounds{aimed.corner[0], aimed.corner[0]};
         for (const Vec3f& v : {aimed.corner[1], aimed.corner[2], aimed.corner[0] + beside}) {

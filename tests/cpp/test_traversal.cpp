@@ -250,6 +250,28 @@ TEST(Traversal, PlainPathIsNearlyTheSame) {
     EXPECT_LT(different, rays.size() / 20);
 }
 
+TEST(Traversal, WhatIsNoRayHarmsNoOther) {
+    const Mesh mesh = make_sphere(24, 32);
+    const Tree tree = build(mesh.soup(), {});
+    std::vector<Ray> rays = make_rays(mesh, 3000, 12);
+    std::vector<Hit> expected(rays.size());
+    intersect(tree, rays, expected);
+    const Ray none[] = {{{NAN, 0, 0}, 0, {1, 0, 0}, 1},
+                        {{0, INFINITY, 0}, 0, {0, 1, 0}, 1},
+                        {{0, 0, 0}, 0, {0, 0, 0}, 1},
+                        {{0, 0, 0}, 0, {-INFINITY, 0, 0}, 1}};
+    for (size_t i = 0; i < rays.size(); i += 5) {
+        rays[i] = none[i / 5 % std::size(none)];
+    }
+    std::vector<Hit> hits(rays.size());
+    intersect(tree, rays, hits);
+    size_t wrong = 0;
+    for (size_t i = 0; i < rays.size(); ++i) {
+        wrong += i % 5 == 0 || (hits[i].triangle == expected[i].triangle && hits[i].t == expected[i].t) ? 0U : 1U;
+    }
+    EXPECT_EQ(wrong, 0U);
+}
+
 TEST(Traversal, KeepsToTheRaysInterval) {
     Mesh mesh;
     mesh.add_triangle({-1, -1, 1}, {2, -1, 1}, {-1, 2, 1});
