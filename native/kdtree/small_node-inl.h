@@ -265,14 +265,9 @@ class SmallNode {
 /// Finishes a node of at most parameters.small_node references; returns the cost of what was built.
 inline float finish_small_node(const References& references, const OpenNode& node, const BuildParameters& parameters,
                                SubtreeOutput& output) {
-    switch (parameters.small_node) {
-        case 256:
-            return SmallNode<8>(references, node, parameters, output).cost();
-        case 128:
-            return SmallNode<4>(references, node, parameters, output).cost();
-        default:
-            return SmallNode<2>(references, node, parameters, output).cost();
-    }
+    return parameters.small_node <= SmallNode<2>::kCapacity
+               ? SmallNode<2>(references, node, parameters, output).cost()
+               : SmallNode<8>(references, node, parameters, output).cost();
 }
 
 }  // namespace espalier::HWY_NAMESPACE
