@@ -59,10 +59,10 @@ int main(int argc, char** argv) {
     try {
         if (argc == 1) {
             std::cout << bench::Json(simd_target_names()) << "\n";
-        } else if (argc > 3) {
+        } else if (argc > 2) {
             std::cout << bench::compare(argv[1], std::stod(argv[2]), {argv + 3, argv + argc}) << "\n";
         } else {
-            std::fputs("usage: espalier_bench [MESH SECONDS PART...]\n", stderr);
+            std::fputs("usage: espalier_bench [MESH SECONDS [PART...]]\n", stderr);
             return 2;
         }
     } catch (const std::exception& error) {

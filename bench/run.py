@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import datetime
 import importlib
+import importlib.util
 import json
 import os
 import platform
@@ -36,8 +37,8 @@ SCENES = ("sculpture",)  # shipped ones, exported as the world's triangles
 INTERIORS = {"sponza"}  # looked at from within
 HOSTILE = ("long", "copies", "coplanar", "furball")  # made by hostile_mesh
 HOSTILE_TRIANGLES = (200_000, 2_000_000)
-PARTS = ("memory", "quality", "builds", "rays", "preview")
-ONCE = {"memory", "quality"}  # parts that are the same for every instruction set
+PARTS = ("memory", "quality", "builds", "rays", "preview", "python")
+ONCE = {"memory", "quality", "python"}  # parts that are the same for every instruction set, or beside a peer's best
 QUIET_LOAD = 0.3
 
 Points = NDArray[np.float32]
@@ -170,6 +171,14 @@ def run(*arguments: str | Path, simd: str = "") -> Any:
     return json.loads(subprocess.run(arguments, env=environment, stdout=subprocess.PIPE, check=True).stdout)
 
 
+def from_python(path: Path, seconds: str, simd: str) -> dict[str, Any]:
+    """Rays from Python beside embreex, where that is installed"""
+    if importlib.util.find_spec("embreex") is None:
+        print("Rays from Python: skipped, there is no embreex (requirements/report.txt)", file=sys.stderr)
+        return {}
+    return dict(run(sys.executable, "-m", "bench.from_python", path, seconds, simd=simd))
+
+
 def compare(options: argparse.Namespace) -> dict[str, Any]:
     """Every mesh with every instruction set; what does not depend on that, with the first alone"""
     start = time.monotonic()
@@ -188,8 +197,10 @@ def compare(options: argparse.Namespace) -> dict[str, Any]:
             parts = [part for part in options.parts.split(",") if simd == simds[0] or part not in ONCE]
             seconds = "12" if options.large else "1" if options.quick or options.hostile else "3"
             if options.scaling or parts:
-                arguments = () if options.scaling else parts
+                arguments = () if options.scaling else [part for part in parts if part != "python"]
                 report["meshes"][name][simd] = run(program, path, seconds, *arguments, simd=simd)
+            if "python" in parts:
+                report["meshes"][name][simd] |= from_python(path, seconds, simd)
     return report
 
 

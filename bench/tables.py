@@ -221,6 +221,18 @@ def scaling_table(meshes: list[tuple[str, dict[str, Any]]]) -> str:
     return table(" | ".join(["mesh", "task", "ms on 1", *(f"speed-up on {count}" for count in counts[1:])]), rows)
 
 
+def python_rows(meshes: list[tuple[str, dict[str, Any]]]) -> Iterable[Sequence[object]]:
+    """One row per mesh and call: millions of rays per second, and the ratio for one thread of each"""
+    for mesh, measured in meshes:
+        of = {(row["call"], row["name"]): row for row in measured["python"]}
+        for call in dict.fromkeys(call for call, _ in of):
+            ours, theirs = of[call, "Espalier"], of[call, "embreex"]
+            gains = [gain * theirs["threads"] / ours["threads"] for gain in ratios(theirs["ms"], ours["ms"])]
+            rates = [f"{row['rays'] / median(row['ms']) / 1e3:.2f}" for row in (ours, theirs)]
+            spread_of = f"{median(gains):.2f} ({min(gains):.2f} to {max(gains):.2f})"
+            yield mesh, call, ours["rays"], ours["threads"], *rates, len(gains), spread_of
+
+
 def header(report: dict[str, Any]) -> str:
     """What was measured on, and with what"""
     machine = report["machine"]
@@ -258,6 +270,9 @@ def markdown(report: dict[str, Any]) -> str:
             "In brackets: wide nodes and blocks of eight triangles that a ray visits. Embree is MEDIUM and ROBUST.",
             ray_table(meshes),
         ]
+    for simd, meshes in per_simd(report, "python").items():
+        head = "mesh | call | rays | threads | Espalier | embreex, one thread | turns | as fast per thread"
+        parts += [f"## Incoherent rays from Python, {simd}, millions per second", table(head, python_rows(meshes))]
     for simd, meshes in per_simd(report, "preview").items():
         head = "mesh | threads | builder | ms | turns | times as fast as MEDIUM | pixels that differ"
         parts += [
@@ -266,7 +281,7 @@ def markdown(report: dict[str, Any]) -> str:
         ]
     for meshes in per_simd(report, "quality").values():
         head = (
-            "mesh | mode | SAH cost, step 15 and block 12 | over exact | SAH cost, step 15 and triangle 20 | "
+            "mesh | mode | SAH cost, step 15 and block 10 | over exact | SAH cost, step 15 and triangle 20 | "
             "nodes | wide nodes | references per triangle | checksum"
         )
         parts += ["## Quality", table(head, quality_rows(meshes))]

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from bench import run
+from bench import from_python, run
 from bench.tables import markdown
 from tests.stage import Stage, ordered, world_triangles
 
@@ -194,6 +194,27 @@ def test_call_that_a_set_was_not_traced_with_is_left_blank() -> None:
     text = markdown(report_of(rays=sets, threads=1))
     assert cells(text, "bunny", "primary")[4:6] == ["0.05", ""]
     assert cells(text, "bunny", "random")[4:6] == ["", "0.05"]
+
+
+def test_rays_from_python_are_compared_per_thread() -> None:
+    rows = [
+        {"name": "Espalier", "call": "occluded", "threads": 2, "rays": 20_000, "ms": [10, 10, 20]},
+        {"name": "embreex", "call": "occluded", "threads": 1, "rays": 20_000, "ms": [40, 50, 60]},
+    ]
+    row = cells(markdown(report_of(python=rows)), "bunny", "occluded")
+    assert row[2:] == ["20000", "2", "2.00", "0.40", "3", "2.00 (1.50 to 2.50)"]
+
+
+def test_rays_from_python_are_timed_on_the_mesh_of_the_file(tmp_path: Path) -> None:
+    run.write_mesh(tmp_path / "t.mesh", TETRAHEDRON, FACES, run.view_of(TETRAHEDRON, inside=False))
+    vertices, triangles = from_python.read_mesh(tmp_path / "t.mesh")
+    assert np.array_equal(vertices, TETRAHEDRON)
+    assert np.array_equal(triangles, FACES)
+    rows = from_python.measure(tmp_path / "t.mesh", 0, count=1000)
+    assert [(row["call"], row["name"]) for row in rows] == [
+        (call, name) for call in ("intersect", "occluded") for name in ("Espalier", "embreex")
+    ]
+    assert all(len(row["ms"]) == 3 and min(row["ms"]) > 0 and row["rays"] == 1000 for row in rows)
 
 
 def test_picture_is_compared_with_medium() -> None:

@@ -27,8 +27,9 @@ constexpr size_t kRaysPerTask = 4096;
 struct RangeEnd {
     float shared = 0.0F;
     Array<float> each;
+    const float* first = each.owner.size() > 0 ? each.owner.data() : nullptr;
 
-    float operator[](size_t ray) const { return each.owner.size() > 0 ? each.owner.data()[ray] : shared; }
+    float operator[](size_t ray) const { return first != nullptr ? first[ray] : shared; }
 };
 
 RangeEnd range_end(py::handle value, const std::string& name, size_t rays) {
@@ -59,26 +60,36 @@ class RayInput {
 
     size_t size() const { return origins_.rows(); }
 
-    /// Calls trace(first, rays) for runs of rays on `threads` threads; throws for the first ray that is not sound.
+    /// How many rays come at once at most.
+    size_t longest_run() const { return std::min(size(), kRaysPerTask); }
+    /// How many threads of those asked for there is work for.
+    int workers(int threads) const {
+        const size_t runs = (size() + kRaysPerTask - 1) / kRaysPerTask;
+        return static_cast<int>(std::min(static_cast<size_t>(threads > 0 ? threads : hardware_threads()), runs));
+    }
+
+    /// Calls trace(first, rays, worker) for runs of rays on `threads` threads, `worker` below workers(threads); throws
+    /// for the first ray that is not sound.
     template <class Trace>
     void for_each_run(int threads, const Trace& trace) {
         const py::gil_scoped_release release;
+        std::vector<Ray> rooms(static_cast<size_t>(workers(threads)) * longest_run());
         std::atomic<size_t> first_bad{size()};
-        parallel_for(
-            threads > 0 ? threads : hardware_threads(), (size() + kRaysPerTask - 1) / kRaysPerTask, [&](size_t task) {
-                const size_t begin = task * kRaysPerTask, end = std::min(begin + kRaysPerTask, size());
-                std::vector<Ray> rays(end - begin);
-                for (size_t i = begin; i < end; ++i) {
-                    rays[i - begin] = ray(i);
-                    if (fault(rays[i - begin]) == nullptr)
-                        continue;
-                    size_t known = first_bad.load(std::memory_order_relaxed);
-                    while (i < known && !first_bad.compare_exchange_weak(known, i, std::memory_order_relaxed)) {
-                    }
-                    return;
-                }
-                trace(begin, std::span<const Ray>(rays));
-            });
+        const size_t runs = (size() + kRaysPerTask - 1) / kRaysPerTask;
+        parallel_for(workers(threads), runs, [&](size_t run, int worker) {
+            Ray* rays = &rooms[static_cast<size_t>(worker) * longest_run()];
+            const size_t begin = run * kRaysPerTask, end = std::min(begin + kRaysPerTask, size());
+            if (pack(begin, end, rays)) {
+                trace(begin, std::span<const Ray>(rays, end - begin), worker);
+                return;
+            }
+            size_t bad = begin;
+            while (fault(ray(bad)) == nullptr)
+                ++bad;
+            size_t known = first_bad.load(std::memory_order_relaxed);
+            while (bad < known && !first_bad.compare_exchange_weak(known, bad, std::memory_order_relaxed)) {
+            }
+        });
         const size_t bad = first_bad.load();
         if (bad < size())
             throw py::value_error("ray " + std::to_string(bad) + ": " + fault(ray(bad)));
@@ -86,12 +97,35 @@ class RayInput {
 
  private:
     Ray ray(size_t i) const {
-        const float* o = origins_.owner.data() + 3 * i;
-        const float* d = directions_.owner.data() + 3 * i;
+        const float* o = first_origin_ + 3 * i;
+        const float* d = first_direction_ + 3 * i;
         return {{o[0], o[1], o[2]}, t_min_[i], {d[0], d[1], d[2]}, t_max_[i]};
     }
 
+    /// Whether all of them are sound.
+    bool pack(size_t begin, size_t end, Ray* rays) const {
+        bool sound = true;
+        for (size_t i = begin; i < end; ++i) {
+            const Ray packed = ray(i);
+            rays[i - begin] = packed;
+            sound &= is_sound(packed);
+        }
+        return sound;
+    }
+
     static float largest_component(Vec3f v) { return std::max({std::abs(v.x), std::abs(v.y), std::abs(v.z)}); }
+
+    /// Whether there is no fault, without a branch.
+    static bool is_sound(const Ray& ray) {
+        bool sound = ray.t_min >= 0.0F;
+        sound &= ray.t_min <= std::numeric_limits<float>::max();
+        sound &= ray.t_max >= ray.t_min;
+        for (int axis = 0; axis < 3; ++axis) {  // comparisons with NaN are false
+            sound &= std::abs(ray.origin[axis]) <= kMaxCoordinate;
+            sound &= std::abs(ray.direction[axis]) <= kLongest;
+        }
+        return sound & (largest_component(ray.direction) >= kShortest);
+    }
 
     static const char* fault(const Ray& ray) {
         if (!is_finite(ray.origin))
@@ -103,7 +137,7 @@ class RayInput {
         const float size = largest_component(ray.direction);
         if (size == 0.0F)
             return "directions is zero";
-        if (size < 0x1p-100F || size > 0x1p100F)
+        if (size < kShortest || size > kLongest)
             return "directions must have its largest component between 2^-100 and 2^100";
         if (!(ray.t_min >= 0.0F) || std::isinf(ray.t_min))
             return "t_min must be finite and not negative";
@@ -112,7 +146,11 @@ class RayInput {
         return nullptr;
     }
 
+    static constexpr float kShortest = 0x1p-100F;
+    static constexpr float kLongest = 0x1p100F;
     Array<float> origins_, directions_;
+    const float* first_origin_ = origins_.owner.data();
+    const float* first_direction_ = directions_.owner.data();
     RangeEnd t_min_, t_max_;
 };
 
@@ -133,8 +171,9 @@ py::dict intersect_rays(const Tree& tree, py::handle origins, py::handle directi
     py::array_t<int32_t> triangle(count);
     float *t_out = t.mutable_data(), *u_out = u.mutable_data(), *v_out = v.mutable_data();
     int32_t* triangle_out = triangle.mutable_data();
-    input.for_each_run(threads, [&](size_t first, std::span<const Ray> rays) {
-        std::vector<Hit> hits(rays.size());
+    std::vector<Hit> rooms(static_cast<size_t>(input.workers(threads)) * input.longest_run());
+    input.for_each_run(threads, [&](size_t first, std::span<const Ray> rays, int worker) {
+        const std::span<Hit> hits(&rooms[static_cast<size_t>(worker) * input.longest_run()], rays.size());
         intersect(tree, rays, hits);
         for (size_t i = 0; i < hits.size(); ++i) {
             const Hit& hit = hits[i];
@@ -155,7 +194,7 @@ py::array_t<bool> occluded_rays(const Tree& tree, py::handle origins, py::handle
     py::array_t<bool> blocked(static_cast<py::ssize_t>(input.size()));
     static_assert(sizeof(bool) == sizeof(uint8_t));
     auto* out = reinterpret_cast<uint8_t*>(blocked.mutable_data());
-    input.for_each_run(threads, [&](size_t first, std::span<const Ray> rays) {
+    input.for_each_run(threads, [&](size_t first, std::span<const Ray> rays, int) {
         occluded(tree, rays, std::span<uint8_t>(out + first, rays.size()));
     });
     return blocked;
