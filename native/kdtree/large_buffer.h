@@ -104,8 +104,9 @@ class LargeBuffer {
  private:
     template <class U>
     friend class LargeBuffer;
-    static constexpr size_t kPage = size_t{64} << 10;            ///< the largest small page of any system
-    static constexpr size_t kHugePagesFrom = size_t{384} << 10;  ///< clearing the rest of the page costs as much
+    static constexpr size_t kPage = size_t{64} << 10;  ///< the largest small page of any system
+    /// From here on clearing the rest of a huge page costs no more than small pages do, and little memory is wasted.
+    static constexpr size_t kHugePagesFrom = size_t{1536} << 10;
     T* data_ = nullptr;
     size_t capacity_ = 0;
     void* mapping_ = nullptr;

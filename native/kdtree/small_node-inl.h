@@ -265,9 +265,8 @@ class SmallNode {
 /// Finishes a node of at most parameters.small_node references; returns the cost of what was built.
 inline float finish_small_node(const References& references, const OpenNode& node, const BuildParameters& parameters,
                                SubtreeOutput& output) {
-    return parameters.small_node <= SmallNode<2>::kCapacity
-               ? SmallNode<2>(references, node, parameters, output).cost()
-               : SmallNode<8>(references, node, parameters, output).cost();
+    return parameters.small_node <= SmallNode<2>::kCapacity ? SmallNode<2>(references, node, parameters, output).cost()
+                                                            : SmallNode<8>(references, node, parameters, output).cost();
 }
 
 }  // namespace espalier::HWY_NAMESPACE
