@@ -70,7 +70,7 @@ build/package.stamp: $(NATIVE) $(ADDON) tools/package.py | native
 
 bench: native
 	@tools/need $(PEERS)
-	@tools/environment .venv "3.11 3.13" -r requirements/report.txt
+	-@tools/environment .venv "3.11 3.13" -r requirements/report.txt  # embreex, which not every machine can get
 	cmake --preset release -B build/bench -DESPALIER_TESTS=OFF -DESPALIER_BENCH=ON >/dev/null
 	cmake --build build/bench -j $(JOBS)
 	python -m bench.run $(BENCH)

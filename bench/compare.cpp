@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// espalier_bench MESH SECONDS PART...: one mesh beside Embree, as JSON on standard output. MESH is a file that run.py
+// espalier_bench MESH SECONDS [PART...]: one mesh beside Embree, as JSON on standard output. MESH is a file that run.py
 // wrote; SECONDS go to each group of contestants; parts are memory, copies=N, quality, builds, rays and preview. The
 // instruction set of both sides is what ESPALIER_SIMD says. Without arguments: the instruction sets that this machine
 // runs.

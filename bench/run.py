@@ -166,7 +166,7 @@ def machine() -> dict[str, Any]:
 
 
 def run(*arguments: str | Path, simd: str = "") -> Any:
-    """What a C++ program prints, with an instruction set forced"""
+    """The JSON that a program prints, with an instruction set forced"""
     environment = {**os.environ, "ESPALIER_SIMD": simd}
     return json.loads(subprocess.run(arguments, env=environment, stdout=subprocess.PIPE, check=True).stdout)
 
@@ -228,6 +228,8 @@ def main() -> None:
         options.parts, options.meshes = f"copies={options.large}", options.meshes or "sculpture"
     if options.hostile:
         options.parts, options.meshes = "builds", options.meshes or ",".join(hostile)
+    if options.scaling:
+        options.parts = ""
     options.meshes = options.meshes or ("sponza,bunny" if options.quick else everything)
     BUILD.mkdir(parents=True, exist_ok=True)
     report = compare(options)

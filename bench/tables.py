@@ -272,7 +272,11 @@ def markdown(report: dict[str, Any]) -> str:
         ]
     for simd, meshes in per_simd(report, "python").items():
         head = "mesh | call | rays | threads | Espalier | embreex, one thread | turns | as fast per thread"
-        parts += [f"## Incoherent rays from Python, {simd}, millions per second", table(head, python_rows(meshes))]
+        parts += [
+            f"## Incoherent rays from Python, {simd}, millions per second",
+            "embreex traces on the calling thread, with an Embree and an instruction set of its own.",
+            table(head, python_rows(meshes)),
+        ]
     for simd, meshes in per_simd(report, "preview").items():
         head = "mesh | threads | builder | ms | turns | times as fast as MEDIUM | pixels that differ"
         parts += [

@@ -128,7 +128,7 @@ def cost_of_plane(lower: Doubles, upper: Doubles, axis: int, plane: float) -> fl
     left[axis], right[axis] = plane - bottom[axis], top[axis] - plane
     children = area(left) * blocks(is_left.sum()) + area(right) * blocks(is_right.sum())
     bonus = 1 if is_left.any() and is_right.any() else 0.9
-    return 15 + 12 * bonus * children / area(top - bottom)
+    return 15 + 10 * bonus * children / area(top - bottom)
 
 
 @pytest.mark.parametrize("count", [90, 120, 1000])

@@ -181,13 +181,16 @@ class Packet {
             const auto differs = [&](V v, float f) { return f < 0 ? hn::Ge(v, hn::Zero(d)) : hn::Lt(v, hn::Zero(d)); };
             const auto turns =
                 hn::Or(differs(dx, towards[kx]), hn::Or(differs(dy, towards[ky]), differs(dz, towards[kz])));
-            if (!hn::AllTrue(d, hn::AndNot(turns, largest_is_z))) {
-                return false;
-            }
             const V sx = hn::Div(dx, dz);
             const V sy = hn::Div(dy, dz);
             const V off_x = hn::Sub(sx, hn::Set(d, focus_.slope_x));
             const V off_y = hn::Sub(sy, hn::Set(d, focus_.slope_y));
+            // What is no ray would take hits from those beside it.
+            const V all =
+                hn::Add(hn::Add(off_x, off_y), hn::Add(hn::Load(d, t_min_ + lane), hn::Load(d, t_max_ + lane)));
+            if (!hn::AllTrue(d, hn::And(hn::AndNot(turns, largest_is_z), hn::Eq(all, all)))) {
+                return false;
+            }
             widest_x = hn::Max(widest_x, hn::Abs(off_x));
             widest_y = hn::Max(widest_y, hn::Abs(off_y));
             hn::Store(sx, d, own_slope_x_ + lane);

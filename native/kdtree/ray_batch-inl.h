@@ -184,7 +184,7 @@ class RayBatch {
         }
     }
 
-    /// Returns how far a rounding of the farthest z that a corner may have moves its x and y.
+    /// Returns how far x and y of a corner may move by its z being rounded; infinitely far for what is no ray.
     HWY_INLINE V set_up_lanes(size_t first, const Ray* rays) {
         const D d;
         const hn::RebindToUnsigned<D> du;

@@ -10,8 +10,8 @@
 namespace espalier {
 
 /// How large triangles are at most, in sixteen powers of two: of class c, no side of a triangle's box is as long as
-/// limit(c). limit(0) is the least power of two above the sides of all triangles' bounds, and no limit lies below
-/// 2^-125. It tells rays how exactly they have to look.
+/// limit(c). limit(0) is the least power of two above the sides of all triangles' bounds, or 2^-110 where those are
+/// tiny, and no limit lies below 2^-125. It tells rays how exactly they have to look.
 class SizeClasses {
  public:
     static constexpr uint32_t kCount = 16;

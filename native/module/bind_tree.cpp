@@ -1,12 +1,13 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 #include <algorithm>
-#include <atomic>
 #include <cmath>
 #include <cstring>
 #include <limits>
 #include <memory>
+#include <mutex>
 #include <vector>
 
+#include "geometry/float_environment.h"
 #include "geometry/triangle.h"
 #include "kdtree/parallel.h"
 #include "kdtree/traversal.h"
@@ -47,75 +48,71 @@ RangeEnd range_end(py::handle value, const std::string& name, size_t rays) {
 /// Rays as they came from Python, checked while they are packed.
 class RayInput {
  public:
-    RayInput(py::handle origins, py::handle directions, py::handle t_min, py::handle t_max)
+    RayInput(py::handle origins, py::handle directions, py::handle t_min, py::handle t_max, int threads)
         : origins_(float_array(origins, "origins", {kAny, 3})),
           directions_(float_array(directions, "directions", {kAny, 3})),
           t_min_(range_end(t_min, "t_min", origins_.rows())),
-          t_max_(range_end(t_max, "t_max", origins_.rows())) {
+          t_max_(range_end(t_max, "t_max", origins_.rows())),
+          runs_((size() + kRaysPerTask - 1) / kRaysPerTask) {
         if (directions_.rows() != origins_.rows()) {
             throw py::value_error("directions must have as many rows as origins (" + std::to_string(origins_.rows()) +
                                   "), not " + std::to_string(directions_.rows()));
         }
+        const int wanted = checked_threads(threads) > 0 ? threads : hardware_threads();
+        workers_ = std::min(static_cast<size_t>(wanted), runs_);
     }
 
     size_t size() const { return origins_.rows(); }
-
     /// How many rays come at once at most.
     size_t longest_run() const { return std::min(size(), kRaysPerTask); }
-    /// How many threads of those asked for there is work for.
-    int workers(int threads) const {
-        const size_t runs = (size() + kRaysPerTask - 1) / kRaysPerTask;
-        return static_cast<int>(std::min(static_cast<size_t>(threads > 0 ? threads : hardware_threads()), runs));
-    }
+    /// How many threads there are and work for.
+    size_t workers() const { return workers_; }
 
-    /// Calls trace(first, rays, worker) for runs of rays on `threads` threads, `worker` below workers(threads); throws
-    /// for the first ray that is not sound.
+    /// Calls trace(first, rays, worker) for runs of rays, `worker` below workers(); throws for the first ray that is
+    /// not sound.
     template <class Trace>
-    void for_each_run(int threads, const Trace& trace) {
+    void for_each_run(const Trace& trace) {
         const py::gil_scoped_release release;
-        std::vector<Ray> rooms(static_cast<size_t>(workers(threads)) * longest_run());
-        std::atomic<size_t> first_bad{size()};
-        const size_t runs = (size() + kRaysPerTask - 1) / kRaysPerTask;
-        parallel_for(workers(threads), runs, [&](size_t run, int worker) {
-            Ray* rays = &rooms[static_cast<size_t>(worker) * longest_run()];
-            const size_t begin = run * kRaysPerTask, end = std::min(begin + kRaysPerTask, size());
-            if (pack(begin, end, rays)) {
-                trace(begin, std::span<const Ray>(rays, end - begin), worker);
+        const FloatEnvironment environment;  // a subnormal number is one here, too
+        std::vector<Ray> packed(workers_ * longest_run());
+        std::mutex mutex;
+        size_t first_bad = size();
+        const char* what = nullptr;
+        parallel_for(static_cast<int>(workers_), runs_, [&](size_t run, int worker) {
+            const std::span<Ray> rays(&packed[static_cast<size_t>(worker) * longest_run()],
+                                      std::min(kRaysPerTask, size() - run * kRaysPerTask));
+            const size_t first = run * kRaysPerTask;
+            if (pack(first, rays)) {
+                trace(first, std::span<const Ray>(rays), worker);
                 return;
             }
-            size_t bad = begin;
-            while (fault(ray(bad)) == nullptr)
-                ++bad;
-            size_t known = first_bad.load(std::memory_order_relaxed);
-            while (bad < known && !first_bad.compare_exchange_weak(known, bad, std::memory_order_relaxed)) {
+            const auto bad = std::find_if_not(rays.begin(), rays.end(), is_sound);
+            const std::lock_guard lock(mutex);
+            if (const size_t number = first + static_cast<size_t>(bad - rays.begin()); number < first_bad) {
+                first_bad = number;
+                what = fault(*bad);
             }
         });
-        const size_t bad = first_bad.load();
-        if (bad < size())
-            throw py::value_error("ray " + std::to_string(bad) + ": " + fault(ray(bad)));
+        if (first_bad < size())
+            throw py::value_error("ray " + std::to_string(first_bad) + ": " + what);
     }
 
  private:
-    Ray ray(size_t i) const {
-        const float* o = first_origin_ + 3 * i;
-        const float* d = first_direction_ + 3 * i;
-        return {{o[0], o[1], o[2]}, t_min_[i], {d[0], d[1], d[2]}, t_max_[i]};
-    }
-
     /// Whether all of them are sound.
-    bool pack(size_t begin, size_t end, Ray* rays) const {
+    bool pack(size_t first, std::span<Ray> rays) const {
         bool sound = true;
-        for (size_t i = begin; i < end; ++i) {
-            const Ray packed = ray(i);
-            rays[i - begin] = packed;
-            sound &= is_sound(packed);
+        for (size_t i = 0; i < rays.size(); ++i) {
+            const float* o = first_origin_ + 3 * (first + i);
+            const float* d = first_direction_ + 3 * (first + i);
+            rays[i] = {{o[0], o[1], o[2]}, t_min_[first + i], {d[0], d[1], d[2]}, t_max_[first + i]};
+            sound &= is_sound(rays[i]);
         }
         return sound;
     }
 
     static float largest_component(Vec3f v) { return std::max({std::abs(v.x), std::abs(v.y), std::abs(v.z)}); }
 
-    /// Whether there is no fault, without a branch.
+    /// Whether there is no fault, found without a branch.
     static bool is_sound(const Ray& ray) {
         bool sound = ray.t_min >= 0.0F;
         sound &= ray.t_min <= std::numeric_limits<float>::max();
@@ -127,6 +124,7 @@ class RayInput {
         return sound & (largest_component(ray.direction) >= kShortest);
     }
 
+    /// What is wrong with a ray that is not sound.
     static const char* fault(const Ray& ray) {
         if (!is_finite(ray.origin))
             return "origins is not finite";
@@ -141,9 +139,7 @@ class RayInput {
             return "directions must have its largest component between 2^-100 and 2^100";
         if (!(ray.t_min >= 0.0F) || std::isinf(ray.t_min))
             return "t_min must be finite and not negative";
-        if (!(ray.t_max >= ray.t_min))
-            return "t_max must not be less than t_min";
-        return nullptr;
+        return "t_max must not be less than t_min";
     }
 
     static constexpr float kShortest = 0x1p-100F;
@@ -152,6 +148,8 @@ class RayInput {
     const float* first_origin_ = origins_.owner.data();
     const float* first_direction_ = directions_.owner.data();
     RangeEnd t_min_, t_max_;
+    size_t runs_;
+    size_t workers_ = 0;
 };
 
 std::unique_ptr<Tree> build_tree(py::handle vertices, py::handle triangles, const std::string& quality, int threads) {
@@ -164,16 +162,15 @@ std::unique_ptr<Tree> build_tree(py::handle vertices, py::handle triangles, cons
 
 py::dict intersect_rays(const Tree& tree, py::handle origins, py::handle directions, py::handle t_min, py::handle t_max,
                         int threads) {
-    RayInput input(origins, directions, t_min, t_max);
-    checked_threads(threads);
+    RayInput input(origins, directions, t_min, t_max, threads);
     const auto count = static_cast<py::ssize_t>(input.size());
     py::array_t<float> t(count), u(count), v(count);
     py::array_t<int32_t> triangle(count);
     float *t_out = t.mutable_data(), *u_out = u.mutable_data(), *v_out = v.mutable_data();
     int32_t* triangle_out = triangle.mutable_data();
-    std::vector<Hit> rooms(static_cast<size_t>(input.workers(threads)) * input.longest_run());
-    input.for_each_run(threads, [&](size_t first, std::span<const Ray> rays, int worker) {
-        const std::span<Hit> hits(&rooms[static_cast<size_t>(worker) * input.longest_run()], rays.size());
+    std::vector<Hit> found(input.workers() * input.longest_run());
+    input.for_each_run([&](size_t first, std::span<const Ray> rays, int worker) {
+        const std::span<Hit> hits(&found[static_cast<size_t>(worker) * input.longest_run()], rays.size());
         intersect(tree, rays, hits);
         for (size_t i = 0; i < hits.size(); ++i) {
             const Hit& hit = hits[i];
@@ -189,12 +186,11 @@ py::dict intersect_rays(const Tree& tree, py::handle origins, py::handle directi
 
 py::array_t<bool> occluded_rays(const Tree& tree, py::handle origins, py::handle directions, py::handle t_min,
                                 py::handle t_max, int threads) {
-    RayInput input(origins, directions, t_min, t_max);
-    checked_threads(threads);
+    RayInput input(origins, directions, t_min, t_max, threads);
     py::array_t<bool> blocked(static_cast<py::ssize_t>(input.size()));
     static_assert(sizeof(bool) == sizeof(uint8_t));
     auto* out = reinterpret_cast<uint8_t*>(blocked.mutable_data());
-    input.for_each_run(threads, [&](size_t first, std::span<const Ray> rays, int) {
+    input.for_each_run([&](size_t first, std::span<const Ray> rays, int) {
         occluded(tree, rays, std::span<uint8_t>(out + first, rays.size()));
     });
     return blocked;

@@ -253,23 +253,53 @@ TEST(Traversal, PlainPathIsNearlyTheSame) {
 TEST(Traversal, WhatIsNoRayHarmsNoOther) {
     const Mesh mesh = make_sphere(24, 32);
     const Tree tree = build(mesh.soup(), {});
-    std::vector<Ray> rays = make_rays(mesh, 3000, 12);
-    std::vector<Hit> expected(rays.size());
-    intersect(tree, rays, expected);
-    const Ray none[] = {{{NAN, 0, 0}, 0, {1, 0, 0}, 1},
-                        {{0, INFINITY, 0}, 0, {0, 1, 0}, 1},
-                        {{0, 0, 0}, 0, {0, 0, 0}, 1},
-                        {{0, 0, 0}, 0, {-INFINITY, 0, 0}, 1}};
-    for (size_t i = 0; i < rays.size(); i += 5) {
-        rays[i] = none[i / 5 % std::size(none)];
+    const auto make_none = [](Ray ray, size_t kind) {
+        Vec3f& d = ray.direction;
+        switch (kind % 7) {
+            case 0:
+                ray.origin.x = NAN;
+                break;
+            case 1:
+                ray.origin.y = INFINITY;
+                break;
+            case 2:
+                d = {0, 0, 0};
+                break;
+            case 3:
+                d.x = -INFINITY;
+                break;
+            case 4:
+                d = {INFINITY, INFINITY, INFINITY};
+                break;
+            case 5:
+                ray.t_min = NAN;
+                break;
+            default:
+                ray.t_max = NAN;
+        }
+        return ray;
+    };
+    // Each on its own way, and as packets.
+    for (std::vector<Ray> rays : {make_rays(mesh, 3000, 12), make_coherent_rays(mesh, 5)}) {
+        std::vector<Hit> expected(rays.size());
+        std::vector<uint8_t> expected_blocked(rays.size());
+        intersect(tree, rays, expected);
+        occluded(tree, rays, expected_blocked);
+        constexpr size_t kEvery = 37;  // another lane in each packet
+        for (size_t i = 0; i < rays.size(); i += kEvery) {
+            rays[i] = make_none(rays[i], i / kEvery);
+        }
+        std::vector<Hit> hits(rays.size());
+        std::vector<uint8_t> blocked(rays.size());
+        intersect(tree, rays, hits);
+        occluded(tree, rays, blocked);
+        size_t wrong = 0;
+        for (size_t i = 0; i < rays.size(); ++i) {
+            const bool same_hit = hits[i].triangle == expected[i].triangle && hits[i].t == expected[i].t;
+            wrong += i % kEvery == 0 || (same_hit && blocked[i] == expected_blocked[i]) ? 0U : 1U;
+        }
+        EXPECT_EQ(wrong, 0U);
     }
-    std::vector<Hit> hits(rays.size());
-    intersect(tree, rays, hits);
-    size_t wrong = 0;
-    for (size_t i = 0; i < rays.size(); ++i) {
-        wrong += i % 5 == 0 || (hits[i].triangle == expected[i].triangle && hits[i].t == expected[i].t) ? 0U : 1U;
-    }
-    EXPECT_EQ(wrong, 0U);
 }
 
 TEST(Traversal, KeepsToTheRaysInterval) {
