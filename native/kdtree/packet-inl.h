@@ -14,6 +14,7 @@
 #include <bit>
 #include <cmath>
 #include <cstdint>
+#include <limits>
 
 #include "kdtree/candidate.h"
 #include "kdtree/focus_view-inl.h"
@@ -148,6 +149,9 @@ class Packet {
                 const V off = hn::MulAdd(hn::Abs(end), hn::Set(d, 0x1p-23F),
                                          hn::Mul(hn::Abs(hn::Sub(end, hn::Set(d, focus[static_cast<int>(axis)]))),
                                                  hn::Set(d, 1 + 0x1p-20F)));
+                if (!hn::AllTrue(d, hn::Le(off, hn::Set(d, std::numeric_limits<float>::max())))) {
+                    return false;
+                }
                 largest = hn::Max(largest, off);
                 hn::Store(hn::Neg(way), d, direction_[axis] + lane);
             }
