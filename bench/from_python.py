@@ -18,22 +18,14 @@ import espalier_native
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
-from numpy.typing import NDArray
+
+from bench.run import Points, read_mesh
 
 RAYS = 1_000_000
 LEAST_TURNS = 3
 
 
-def read_mesh(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    """Positions and indices, as run.py writes them"""
-    data = path.read_bytes()
-    vertices, triangles = np.frombuffer(data, np.uint64, 2).tolist()
-    start = 2 * 8 + 13 * 4
-    positions = np.frombuffer(data, np.float32, 3 * vertices, start).reshape(-1, 3)
-    return positions, np.frombuffer(data, np.uint32, 3 * triangles, start + positions.nbytes).reshape(-1, 3)
-
-
-def incoherent_rays(vertices: NDArray[np.float32], count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def incoherent_rays(vertices: Points, count: int) -> tuple[Points, Points]:
     """Origins within the box and directions of length 1, both evenly distributed"""
     rng = np.random.default_rng(1)
     low, high = vertices.min(axis=0), vertices.max(axis=0)

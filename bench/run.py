@@ -129,6 +129,15 @@ def write_mesh(path: Path, vertices: Points, triangles: Triangles, view: Points)
         np.ascontiguousarray(triangles, np.uint32).tofile(file)
 
 
+def read_mesh(path: Path) -> tuple[Points, Triangles]:
+    """Positions and indices of such a file"""
+    data = path.read_bytes()
+    vertices, triangles = np.frombuffer(data, np.uint64, 2).tolist()
+    start = 2 * 8 + 13 * 4
+    positions = np.frombuffer(data, np.float32, 3 * vertices, start).reshape(-1, 3)
+    return positions, np.frombuffer(data, np.uint32, 3 * triangles, start + positions.nbytes).reshape(-1, 3)
+
+
 def prepare(name: str) -> Path | None:
     """The file of a mesh for the C++ programs, written when its source is newer; None where there is no source"""
     path = BUILD / f"{name}.mesh"
@@ -194,10 +203,10 @@ def compare(options: argparse.Namespace) -> dict[str, Any]:
         report["meshes"][name] = {}
         for simd in simds:
             print(f"{time.monotonic() - start:4.0f} s  {name}, {simd}", file=sys.stderr)
-            parts = [part for part in options.parts.split(",") if simd == simds[0] or part not in ONCE]
+            parts = [part for part in options.parts if simd == simds[0] or part not in ONCE]
             seconds = "12" if options.large else "1" if options.quick or options.hostile else "3"
             if options.scaling or parts:
-                arguments = () if options.scaling else [part for part in parts if part != "python"]
+                arguments = [part for part in parts if part != "python"]
                 report["meshes"][name][simd] = run(program, path, seconds, *arguments, simd=simd)
             if "python" in parts:
                 report["meshes"][name][simd] |= from_python(path, seconds, simd)
@@ -224,12 +233,13 @@ def main() -> None:
     parser.add_argument("--hostile", action="store_true", help=f"instead: builds of {', '.join(hostile)}")
     parser.add_argument("--scaling", action="store_true", help="instead: 1, 2, 4 ... threads, without Embree")
     options = parser.parse_args()
+    options.parts = options.parts.split(",")
     if options.large:
-        options.parts, options.meshes = f"copies={options.large}", options.meshes or "sculpture"
+        options.parts, options.meshes = [f"copies={options.large}"], options.meshes or "sculpture"
     if options.hostile:
-        options.parts, options.meshes = "builds", options.meshes or ",".join(hostile)
+        options.parts, options.meshes = ["builds"], options.meshes or ",".join(hostile)
     if options.scaling:
-        options.parts = ""
+        options.parts = []
     options.meshes = options.meshes or ("sponza,bunny" if options.quick else everything)
     BUILD.mkdir(parents=True, exist_ok=True)
     report = compare(options)

@@ -28,9 +28,9 @@ def table(head: str, rows: Iterable[Sequence[object]]) -> str:
     return "\n".join(lines)
 
 
-def spread(ms: Times) -> str:
+def spread(values: Sequence[float]) -> str:
     """Median, least and greatest"""
-    return f"{median(ms):.2f} ({min(ms):.2f} to {max(ms):.2f})"
+    return f"{median(values):.2f} ({min(values):.2f} to {max(values):.2f})"
 
 
 def ratios(over: Times, under: Times) -> list[float]:
@@ -164,7 +164,7 @@ def ray_table(meshes: list[tuple[str, dict[str, Any]]]) -> str:
                 group["set"],
                 group["rays"],
                 *map(cell, names),
-                f"{median(gain):.2f} ({min(gain):.2f} to {max(gain):.2f})",
+                spread(gain),
                 price(times, threads),
                 efficiency(times, DEFAULT_MODE, threads),
                 group["differ"],
@@ -229,8 +229,7 @@ def python_rows(meshes: list[tuple[str, dict[str, Any]]]) -> Iterable[Sequence[o
             ours, theirs = of[call, "Espalier"], of[call, "embreex"]
             gains = [gain * theirs["threads"] / ours["threads"] for gain in ratios(theirs["ms"], ours["ms"])]
             rates = [f"{row['rays'] / median(row['ms']) / 1e3:.2f}" for row in (ours, theirs)]
-            spread_of = f"{median(gains):.2f} ({min(gains):.2f} to {max(gains):.2f})"
-            yield mesh, call, ours["rays"], ours["threads"], *rates, len(gains), spread_of
+            yield mesh, call, ours["rays"], ours["threads"], *rates, len(gains), spread(gains)
 
 
 def header(report: dict[str, Any]) -> str:

@@ -207,7 +207,7 @@ def test_rays_from_python_are_compared_per_thread() -> None:
 
 def test_rays_from_python_are_timed_on_the_mesh_of_the_file(tmp_path: Path) -> None:
     run.write_mesh(tmp_path / "t.mesh", TETRAHEDRON, FACES, run.view_of(TETRAHEDRON, inside=False))
-    vertices, triangles = from_python.read_mesh(tmp_path / "t.mesh")
+    vertices, triangles = run.read_mesh(tmp_path / "t.mesh")
     assert np.array_equal(vertices, TETRAHEDRON)
     assert np.array_equal(triangles, FACES)
     rows = from_python.measure(tmp_path / "t.mesh", 0, count=1000)

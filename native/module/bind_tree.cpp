@@ -100,10 +100,10 @@ class RayInput {
  private:
     /// Whether all of them are sound.
     bool pack(size_t first, std::span<Ray> rays) const {
+        const float* o = origins_.span().data() + 3 * first;
+        const float* d = directions_.span().data() + 3 * first;
         bool sound = true;
-        for (size_t i = 0; i < rays.size(); ++i) {
-            const float* o = first_origin_ + 3 * (first + i);
-            const float* d = first_direction_ + 3 * (first + i);
+        for (size_t i = 0; i < rays.size(); ++i, o += 3, d += 3) {
             rays[i] = {{o[0], o[1], o[2]}, t_min_[first + i], {d[0], d[1], d[2]}, t_max_[first + i]};
             sound &= is_sound(rays[i]);
         }
@@ -145,8 +145,6 @@ class RayInput {
     static constexpr float kShortest = 0x1p-100F;
     static constexpr float kLongest = 0x1p100F;
     Array<float> origins_, directions_;
-    const float* first_origin_ = origins_.owner.data();
-    const float* first_direction_ = directions_.owner.data();
     RangeEnd t_min_, t_max_;
     size_t runs_;
     size_t workers_ = 0;
