@@ -19,6 +19,11 @@ struct Nearest {
     float upper;
 };
 
+/// Of the triangle at `place`; other coordinates follow kBlockSize floats behind, corner by corner.
+inline const float* corners_at(const TriangleBlock* blocks, uint32_t place) {
+    return blocks[place / kBlockSize].vertex[0][0] + place % kBlockSize;
+}
+
 /// The triangle at `place` takes the nearest's if exact arithmetic says that the ray hits it within its interval, and
 /// nearer than the other, or as near with a lower index. Returns whether it did.
 bool take_exactly(const Ray& ray, const TriangleBlock* blocks, uint32_t place, Nearest& nearest);

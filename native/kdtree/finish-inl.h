@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// The distance and the place of known hits, sixteen rays at a time in double. Compiled once per instruction set (see
-// traversal.cpp).
+// The distance and the place of known hits, in double. Compiled once per instruction set (see traversal.cpp).
 
 #if defined(ESPALIER_KDTREE_FINISH_INL_H_) == defined(HWY_TARGET_TOGGLE)
 #ifdef ESPALIER_KDTREE_FINISH_INL_H_
@@ -11,136 +10,187 @@
 
 #include <hwy/highway.h>
 
+#include <algorithm>
 #include <bit>
+#include <cstddef>
 #include <cstdint>
+#include <limits>
 #include <span>
 #include <type_traits>
 
 #include "kdtree/candidate.h"
-#include "kdtree/ray_batch-inl.h"
+#include "kdtree/packet-inl.h"
 #include "kdtree/traced_ray-inl.h"
-#include "kdtree/triangle_test-inl.h"
 
 HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
 namespace hn = hwy::HWY_NAMESPACE;
 
+template <class V>
+HWY_INLINE void cross(const V (&a)[3], const V (&b)[3], V (&result)[3]) {
+    for (size_t axis = 0; axis < 3; ++axis) {
+        const size_t next = (axis + 1) % 3;
+        const size_t last = (axis + 2) % 3;
+        result[axis] = hn::Sub(hn::Mul(a[next], b[last]), hn::Mul(a[last], b[next]));
+    }
+}
+
+template <class V>
+HWY_INLINE V dot(const V (&a)[3], const V (&b)[3]) {
+    return hn::Add(hn::Add(hn::Mul(a[0], b[0]), hn::Mul(a[1], b[1])), hn::Mul(a[2], b[2]));
+}
+
+/// Floats as T.
+template <class D, class VF>
+HWY_INLINE hn::Vec<D> widened(D d, VF v) {
+    if constexpr (std::is_same_v<hn::TFromD<D>, double>) {
+        return hn::PromoteTo(d, v);
+    } else {
+        return v;
+    }
+}
+
+/// What decides where rays from one origin hit a triangle, whatever their direction (Moeller and Trumbore 1997, in
+/// another order): with det = d . normal, t = volume / det, u = d . u_normal / det, v = d . v_normal / det.
+template <class V>
+struct HitEquations {
+    V normal[3];
+    V u_normal[3];
+    V v_normal[3];
+    V volume;
+    V least_det;  ///< of directions of size 1, for V to suffice; infinite where it does for none
+
+    /// No operation is fused, so that every instruction set takes the same way. With e = 2^-53, D, S, A and B the
+    /// largest components of the direction, the first corner as seen from the origin and the two edges from there, det
+    /// is off by less than 41 e D A B, the volume by 47 e S A B, and the other products by 41 e D S max(A, B)
+    /// (EXACTNESS.md, 12). Float, for the path that does without exactness, is taken as it comes.
+    HWY_INLINE HitEquations(const V (&origin)[3], const V (&corner)[3][3]) {
+        const hn::DFromV<V> d;
+        V seen[3];
+        V edge[2][3];
+        for (size_t axis = 0; axis < 3; ++axis) {
+            seen[axis] = hn::Sub(corner[0][axis], origin[axis]);
+            edge[0][axis] = hn::Sub(corner[1][axis], corner[0][axis]);
+            edge[1][axis] = hn::Sub(corner[2][axis], corner[0][axis]);
+        }
+        cross(edge[0], edge[1], normal);
+        cross(edge[1], seen, u_normal);
+        cross(seen, edge[0], v_normal);
+        volume = dot(seen, normal);
+        if constexpr (std::is_same_v<hn::TFromV<V>, double>) {
+            const V distance = largest_of(seen);
+            const V size[2] = {largest_of(edge[0]), largest_of(edge[1])};
+            const V area = hn::Mul(size[0], size[1]);
+            const V side = hn::Mul(distance, hn::Max(size[0], size[1]));
+            const V least = hn::Max(hn::Mul(area, hn::Set(d, 42 * 0x1p-25)), hn::Mul(side, hn::Set(d, 42 * 0x1p-30)));
+            const auto is_volume_good =
+                hn::Ge(hn::Abs(volume), hn::Mul(hn::Mul(distance, area), hn::Set(d, 48 * 0x1p-25)));
+            least_det = hn::IfThenElse(is_volume_good, least, hn::Inf(d));
+        }
+    }
+};
+
+/// Hits in columns.
+template <size_t kSize>
+struct HitColumns {
+    alignas(64) float t[kSize];
+    alignas(64) float u[kSize];
+    alignas(64) float v[kSize];
+
+    /// Fills in the lanes from `first` on that the mask selects. Returns those of them for which double does not
+    /// suffice.
+    template <class V, class DF>
+    HWY_INLINE uint32_t put(DF df, size_t first, hn::Mask<DF> lanes, const V (&direction)[3],
+                            const HitEquations<V>& equations) {
+        const hn::DFromV<V> d;
+        const V det = dot(direction, equations.normal);
+        const V scale = hn::Div(hn::Set(d, 1), det);
+        const V distance = hn::Mul(equations.volume, scale);
+        const auto store = [&](V value, float* to) {
+            if constexpr (std::is_same_v<hn::TFromV<V>, double>) {
+                hn::BlendedStore(hn::DemoteTo(df, value), lanes, df, to + first);
+            } else {
+                hn::BlendedStore(value, lanes, df, to + first);
+            }
+        };
+        store(distance, t);
+        store(hn::Max(hn::Mul(dot(direction, equations.u_normal), scale), hn::Zero(d)), u);
+        store(hn::Max(hn::Mul(dot(direction, equations.v_normal), scale), hn::Zero(d)), v);
+        if constexpr (std::is_same_v<hn::TFromV<V>, double>) {
+            const auto is_sure =
+                hn::And(hn::Ge(hn::Abs(det), hn::Mul(equations.least_det, largest_of(direction))),
+                        hn::Le(hn::Abs(distance), hn::Set(d, double{std::numeric_limits<float>::max()})));
+            return mask_bits(df, lanes) & ~mask_bits(d, is_sure);
+        } else {
+            return 0;
+        }
+    }
+
+    /// Of the triangles with these numbers, kNoTriangle where there is none.
+    HWY_INLINE void write(const uint32_t* triangles, Hit* hits) const {
+        static_assert(sizeof(Hit) == 4 * sizeof(float) && offsetof(Hit, triangle) == 3 * sizeof(float));
+        const hn::CappedTag<float, 16> d;
+        const hn::RebindToUnsigned<decltype(d)> du;
+        for (size_t lane = 0; lane < kSize; lane += hn::Lanes(d)) {
+            hn::StoreInterleaved4(hn::Load(d, t + lane), hn::Load(d, u + lane), hn::Load(d, v + lane),
+                                  hn::BitCast(d, hn::Load(du, triangles + lane)), d, &hits[lane].t);
+        }
+    }
+};
+
 /// Rays and the triangles they hit.
-struct alignas(64) FinishBatch {
+struct alignas(64) FinishBatch : HitColumns<16> {
     static constexpr size_t kSize = 16;
     float origin[kSize][4];     ///< and t_min, which is not needed
     float direction[kSize][4];  ///< and t_max
     float corner[3][3][kSize];  ///< [corner][axis][lane]
-    float t[kSize];
-    float u[kSize];
-    float v[kSize];
 
-    HWY_INLINE void put(size_t lane, const Ray& ray, const TriangleBlock* blocks, uint32_t place) {
+    HWY_INLINE void put_ray(size_t lane, const Ray& ray, const TriangleBlock* blocks, uint32_t place) {
         const hn::CappedTag<float, 4> d;
         hn::Store(hn::LoadU(d, &ray.origin.x), d, origin[lane]);
         hn::Store(hn::LoadU(d, &ray.direction.x), d, direction[lane]);
-        const float* from = blocks[place / kBlockSize].vertex[0][0] + place % kBlockSize;
+        const float* from = corners_at(blocks, place);
         for (size_t k = 0; k < 3; ++k) {
             for (size_t axis = 0; axis < 3; ++axis) {
                 corner[k][axis][lane] = from[(k * 3 + axis) * kBlockSize];
             }
         }
     }
-};
 
-/// Fills in t, u and v; returns the lanes for which T does not suffice. No operation is fused, so that every
-/// instruction set takes the same way.
-///
-/// Sheared as in the float filter, but in double, and times the direction's z, which saves a division. With e = 2^-53
-/// and m = mz |direction z|, an edge function is then off by less than e s (4.25 s + 8.5 m) = bound (EXACTNESS.md, 12).
-/// Errors of the weights move the depth by less than 3.25 bound / |det| times what the corners lie apart, at most 2 mz,
-/// and other roundings by 2^-49 mz. Float, for the path that does without exactness, is taken as it comes.
-template <class T>
-HWY_INLINE uint32_t finish(FinishBatch& batch) {
-    constexpr bool kExact = sizeof(T) == sizeof(double);
-    const hn::CappedTag<T, FinishBatch::kSize> d;
-    const hn::Rebind<float, decltype(d)> df;
-    constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<T, FinishBatch::kSize>());
-    using V = hn::Vec<decltype(d)>;
-    using VF = hn::Vec<decltype(df)>;
-    uint32_t open = 0;
-    for (size_t first = 0; first < FinishBatch::kSize; first += kLanes) {
-        VF unused;
-        VF origin[3];
-        VF direction[3];
-        hn::LoadInterleaved4(df, batch.origin[first], origin[0], origin[1], origin[2], unused);
-        hn::LoadInterleaved4(df, batch.direction[first], direction[0], direction[1], direction[2], unused);
-        const LaneAxes<VF> axes(direction);
-        const auto permute = [&](const VF(&from)[3], V(&to)[3]) {
-            for (size_t axis = 0; axis < 3; ++axis) {
-                if constexpr (kExact) {
-                    to[axis] = hn::PromoteTo(d, axes.pick(from, axis));
-                } else {
-                    to[axis] = axes.pick(from, axis);
+    /// Fills in t, u and v; returns the lanes for which T does not suffice.
+    template <class T>
+    HWY_INLINE uint32_t finish() {
+        const hn::CappedTag<T, kSize> d;
+        const hn::Rebind<float, decltype(d)> df;
+        constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<T, kSize>());
+        using V = hn::Vec<decltype(d)>;
+        uint32_t open = 0;
+        for (size_t first = 0; first < kSize; first += kLanes) {
+            const auto columns = [&](const float (&rows)[kSize][4], V(&to)[3]) {
+                hn::Vec<decltype(df)> column[4];
+                hn::LoadInterleaved4(df, rows[first], column[0], column[1], column[2], column[3]);
+                for (size_t axis = 0; axis < 3; ++axis) {
+                    to[axis] = widened(d, column[axis]);
+                }
+            };
+            V from[3];
+            V along[3];
+            V triangle[3][3];
+            columns(origin, from);
+            columns(direction, along);
+            for (size_t k = 0; k < 3; ++k) {
+                for (size_t axis = 0; axis < 3; ++axis) {
+                    triangle[k][axis] = widened(d, hn::Load(df, corner[k][axis] + first));
                 }
             }
-        };
-        V from[3];
-        V along[3];
-        permute(origin, from);
-        permute(direction, along);
-        const auto store = [&](V value, float* to) {
-            if constexpr (kExact) {
-                hn::Store(hn::DemoteTo(df, value), df, to + first);
-            } else {
-                hn::Store(value, d, to + first);
-            }
-        };
-        V z[3];
-        V across[2][3];
-        for (size_t k = 0; k < 3; ++k) {
-            const VF given[3] = {hn::Load(df, batch.corner[k][0] + first), hn::Load(df, batch.corner[k][1] + first),
-                                 hn::Load(df, batch.corner[k][2] + first)};
-            V corner[3];
-            permute(given, corner);
-            z[k] = hn::Sub(corner[2], from[2]);
-            for (size_t axis = 0; axis < 2; ++axis) {
-                const V seen = hn::Sub(corner[axis], from[axis]);
-                across[axis][k] = hn::Sub(hn::Mul(seen, along[2]), hn::Mul(along[axis], z[k]));
-            }
+            open |= this->put(df, first, hn::FirstN(df, kLanes), along, HitEquations<V>(from, triangle)) << first;
         }
-        const V(&x)[3] = across[0];
-        const V(&y)[3] = across[1];
-        V side[3];
-        for (size_t k = 0; k < 3; ++k) {
-            const size_t a = (k + 1) % 3;
-            const size_t b = (k + 2) % 3;
-            side[k] = hn::Sub(hn::Mul(x[b], y[a]), hn::Mul(y[b], x[a]));
-        }
-        const V det = hn::Add(hn::Add(side[0], side[1]), side[2]);
-        const V scale = hn::Div(hn::Set(d, 1), hn::Mul(det, along[2]));
-        const V per_det = hn::Mul(scale, along[2]);
-        const V depth_sum = hn::Add(hn::Add(hn::Mul(side[0], z[0]), hn::Mul(side[1], z[1])), hn::Mul(side[2], z[2]));
-        const V t = hn::Mul(depth_sum, scale);
-        if constexpr (kExact) {
-            const V mz = largest_of(z);
-            const V m = hn::Mul(mz, hn::Abs(along[2]));
-            const V s = hn::Add(hn::Add(largest_of(x), largest_of(y)), hn::Mul(m, hn::Set(d, 5.5 * 0x1p-53)));
-            const V bound =
-                hn::Mul(s, hn::Add(hn::Mul(s, hn::Set(d, 4.25 * 0x1p-53)), hn::Mul(m, hn::Set(d, 8.5 * 0x1p-53))));
-            // The depth's error against 2^-28 of it, both times |det|.
-            const V error =
-                hn::Mul(mz, hn::Add(hn::Mul(bound, hn::Set(d, 6.5)), hn::Mul(hn::Abs(det), hn::Set(d, 0x1p-49))));
-            const auto t_sure = hn::And(hn::Le(error, hn::Mul(hn::Abs(depth_sum), hn::Set(d, 0x1p-28))),
-                                        hn::Le(hn::Abs(t), hn::Set(d, double{std::numeric_limits<float>::max()})));
-            // Follows from that, unless all corners lie at depth 0.
-            const auto place_sure = hn::Le(bound, hn::Mul(hn::Abs(det), hn::Set(d, 0x1p-30)));
-            const auto sure = hn::And(t_sure, place_sure);
-            open |= (~mask_bits(d, sure) & ((1U << kLanes) - 1)) << first;
-        }
-        store(t, batch.t);
-        store(hn::Max(hn::Mul(side[1], per_det), hn::Zero(d)), batch.u);
-        store(hn::Max(hn::Mul(side[2], per_det), hn::Zero(d)), batch.v);
+        return open;
     }
-    return open;
-}
+};
 
-/// Hits that wait to be finished together.
+/// Takes in where rays have hit, and fills their hits in: those of packets that hit few triangles at once, others when
+/// sixteen have come together.
 template <bool kExact>
 class FinishQueue {
  public:
@@ -148,14 +198,39 @@ class FinishQueue {
         : blocks_(blocks), rays_(rays), hits_(hits) {}
 
     HWY_INLINE void add(uint32_t ray, uint32_t place) {
+        if (place == kNoPlace) {
+            hits_[ray] = missed(rays_[ray]);
+            return;
+        }
         // Not as soon as it is full: what was just written lane by lane cannot be read as a vector at once.
         if (count_ == FinishBatch::kSize) {
             flush();
         }
-        batch_.put(count_, rays_[ray], blocks_, place);
+        batch_.put_ray(count_, rays_[ray], blocks_, place);
         ray_[count_] = ray;
         place_[count_] = place;
         ++count_;
+    }
+
+    /// The packet's rays, from number `first` on.
+    HWY_INLINE void add(uint32_t first, const Packet<false, kExact>& packet) {
+        uint32_t places[kFew];
+        uint32_t lanes[kFew];
+        size_t count = 0;
+        uint32_t rest = ~packet.rays_at(kNoPlace);
+        static_assert(Packet<false, kExact>::kRays == 32);
+        for (; rest != 0 && count < kFew; ++count) {
+            places[count] = packet.place(static_cast<size_t>(std::countr_zero(rest)));
+            lanes[count] = packet.rays_at(places[count]);
+            rest &= ~lanes[count];
+        }
+        if (rest != 0) {
+            for (uint32_t lane = 0; lane < Packet<false, kExact>::kRays; ++lane) {
+                add(first + lane, packet.place(lane));
+            }
+            return;
+        }
+        finish_packet(first, packet, {places, count}, {lanes, count});
     }
 
     HWY_NOINLINE void flush() {
@@ -163,9 +238,9 @@ class FinishQueue {
             return;
         }
         for (size_t lane = count_; lane < FinishBatch::kSize; ++lane) {
-            batch_.put(lane, rays_[ray_[0]], blocks_, place_[0]);
+            batch_.put_ray(lane, rays_[ray_[0]], blocks_, place_[0]);
         }
-        const uint32_t open = finish<std::conditional_t<kExact, double, float>>(batch_);
+        const uint32_t open = batch_.finish<Number>();
         for (size_t i = 0; i < count_; ++i) {
             const uint32_t ray = ray_[i];
             hits_[ray] = {batch_.t[i], batch_.u[i], batch_.v[i], static_cast<int32_t>(triangle_at(blocks_, place_[i]))};
@@ -178,6 +253,51 @@ class FinishQueue {
     }
 
  private:
+    using Number = std::conditional_t<kExact, double, float>;
+    /// More triangles are not worth their equations being solved for all rays.
+    static constexpr size_t kFew = 8;
+
+    HWY_NOINLINE void finish_packet(uint32_t first, const Packet<false, kExact>& packet,
+                                    std::span<const uint32_t> places, std::span<const uint32_t> lanes) {
+        constexpr size_t kRays = Packet<false, kExact>::kRays;
+        const hn::CappedTag<Number, kRays> d;
+        const hn::Rebind<float, decltype(d)> df;
+        constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<Number, kRays>());
+        using V = hn::Vec<decltype(d)>;
+        HitColumns<kRays> columns;
+        std::copy_n(packet.t_max(), kRays, columns.t);
+        std::fill_n(columns.u, kRays, 0.0F);
+        std::fill_n(columns.v, kRays, 0.0F);
+        const Vec3f focus = rays_[first].origin;
+        const V origin[3] = {hn::Set(d, Number{focus.x}), hn::Set(d, Number{focus.y}), hn::Set(d, Number{focus.z})};
+        uint32_t open = 0;
+        for (size_t i = 0; i < places.size(); ++i) {
+            const float* from = corners_at(blocks_, places[i]);
+            V corner[3][3];
+            for (size_t k = 0; k < 3; ++k) {
+                for (size_t axis = 0; axis < 3; ++axis) {
+                    corner[k][axis] = hn::Set(d, Number{from[(k * 3 + axis) * kBlockSize]});
+                }
+            }
+            const HitEquations<V> equations(origin, corner);
+            for (size_t lane = 0; lane < kRays; lane += kLanes) {
+                const uint32_t here = lanes[i] >> lane & ((1U << kLanes) - 1);
+                if (here != 0) {
+                    V direction[3];
+                    for (size_t axis = 0; axis < 3; ++axis) {
+                        direction[axis] = widened(d, hn::Load(df, packet.direction(axis) + lane));
+                    }
+                    open |= columns.put(df, lane, mask_of(df, here), direction, equations) << lane;
+                }
+            }
+        }
+        columns.write(packet.triangles(), &hits_[first]);
+        for (; open != 0; open &= open - 1) {
+            const auto lane = static_cast<uint32_t>(std::countr_zero(open));
+            hits_[first + lane] = finish_exactly(rays_[first + lane], blocks_, packet.place(lane));
+        }
+    }
+
     const TriangleBlock* blocks_;
     std::span<const Ray> rays_;
     std::span<Hit> hits_;

@@ -62,8 +62,8 @@ struct FocusView {
     static constexpr size_t kSize = kBlocksPerStep * kBlockSize;
     alignas(64) float normal[3][3][kSize];  ///< [edge][axis]: an edge function is n.z - off_y n.y - off_x n.x
     alignas(64) float bound[kSize];         ///< no edge function is off by more
-    alignas(64) float z[3][kSize];          ///< the first corner's, and of the others what they lie behind it
-    alignas(64) float size[kSize];          ///< the largest |z|
+    alignas(64) float depth[3][kSize];      ///< the first corner's, and of the others what they lie behind it
+    alignas(64) float size[kSize];          ///< the largest |depth|
 
     /// Fills all in. Returns the lanes that a ray of the packet may meet at depths from `entry` to `reach`, if its
     /// slopes are any that the packet's may be: those that neither an edge nor a plane that bounds the rays parts from
@@ -130,20 +130,20 @@ struct FocusView {
             const auto possible = hn::Ge(hn::Max(most_inside, hn::Neg(least_inside)),
                                          hn::Neg(hn::Mul(bound_here, hn::Set(d, 1 + 0x1p-10F))));
             const V sign = hn::Set(d, focus.sign);
-            const V depth[3] = {hn::Mul(z_of[0], sign), hn::Mul(z_of[1], sign), hn::Mul(z_of[2], sign)};
+            const V depth_of[3] = {hn::Mul(z_of[0], sign), hn::Mul(z_of[1], sign), hn::Mul(z_of[2], sign)};
             const V room = hn::MulAdd(mz, hn::Set(d, 0x1p-20F), hn::Set(d, kTiny));
-            const V nearest = hn::Sub(hn::Min(depth[0], hn::Min(depth[1], depth[2])), room);
-            const V farthest = hn::Add(hn::Max(depth[0], hn::Max(depth[1], depth[2])), room);
+            const V nearest = hn::Sub(hn::Min(depth_of[0], hn::Min(depth_of[1], depth_of[2])), room);
+            const V farthest = hn::Add(hn::Max(depth_of[0], hn::Max(depth_of[1], depth_of[2])), room);
             const auto in_range = hn::And(hn::Le(nearest, hn::Set(d, reach)), hn::Ge(farthest, hn::Set(d, entry)));
             // Small triangles among wide rays are often parted from them by none of their own edges.
             const V beside =
-                hn::Max(distance_beside(x, depth, focus.spread_x), distance_beside(y, depth, focus.spread_y));
+                hn::Max(distance_beside(x, depth_of, focus.spread_x), distance_beside(y, depth_of, focus.spread_y));
             const auto among = hn::Le(beside, hn::MulAdd(hn::Set(d, 2.0F), margin, hn::Set(d, kTiny)));
             reached |= mask_bits(d, hn::And(hn::And(possible, in_range), among)) << first;
             hn::Store(bound_here, d, bound + first);
-            hn::Store(z_of[0], d, z[0] + first);
-            hn::Store(hn::Sub(z_of[1], z_of[0]), d, z[1] + first);
-            hn::Store(hn::Sub(z_of[2], z_of[0]), d, z[2] + first);
+            hn::Store(depth_of[0], d, depth[0] + first);
+            hn::Store(hn::Sub(depth_of[1], depth_of[0]), d, depth[1] + first);
+            hn::Store(hn::Sub(depth_of[2], depth_of[0]), d, depth[2] + first);
             hn::Store(mz, d, size + first);
         }
         return reached;

@@ -95,6 +95,17 @@ class Packet {
     }
 
     uint32_t place(size_t lane) const { return place_[lane]; }
+    /// The rays, a bit each, that end at this place.
+    HWY_INLINE uint32_t rays_at(uint32_t place) const {
+        uint32_t found = 0;
+        for (size_t lane = 0; lane < kRays; lane += kLanes) {
+            found |= mask_bits(du, hn::Eq(hn::Load(du, place_ + lane), hn::Set(du, place))) << lane;
+        }
+        return found;
+    }
+    const uint32_t* triangles() const { return triangle_; }
+    const float* direction(size_t axis) const { return direction_[axis]; }
+    const float* t_max() const { return t_max_; }
 
  private:
     using View = FocusView<kExact>;
@@ -272,8 +283,7 @@ class Packet {
             hn::Store(limits.start, d, start_ + lane);
             hn::Store(limits.reach, d, reaches_ + lane);
             hn::Store(limits.sure_start, d, sure_start_ + lane);
-            hn::Store(limits.sure_end, d, sure_end_ + lane);
-            hn::Store(hn::Inf(d), d, lower_ + lane);
+            hn::Store(limits.sure_end, d, sure_before_ + lane);
             hn::Store(hn::Set(du, kNoPlace), du, place_ + lane);
             hn::Store(hn::Set(du, kNoTriangle), du, triangle_ + lane);
             V box_start = limits.start;
@@ -445,23 +455,33 @@ class Packet {
                 continue;
             }
             // Where the view from the packet's middle is too coarse for one of the rays, their own are finer.
-            const V det = hn::Abs(hn::Add(side[0], hn::Add(side[1], side[2])));
+            const V det = hn::Add(side[0], hn::Add(side[1], side[2]));
             const auto is_clear =
-                hn::And(hn::Gt(depth_inside(side), bound), hn::Ge(det, hn::Mul(bound, hn::Set(d, 64))));
+                hn::And(hn::Gt(depth_inside(side), bound), hn::Ge(hn::Abs(det), hn::Mul(bound, hn::Set(d, 64))));
             if (kExact && !hn::AllFalse(d, hn::AndNot(is_clear, inside))) {
                 taken |= test_from_origins(lane, place);
                 continue;
             }
-            taken |= take(lane, side, depth_inside(side), inside, bound, hn::Set(d, view.size[triangle]),
-                          hn::Set(d, view.z[0][triangle]), hn::Set(d, view.z[1][triangle]),
-                          hn::Set(d, view.z[2][triangle]), focus_.sign, place);
+            // As depth_range has it, but all that counts is sound, and much of it the same for all rays.
+            const float r1 = view.depth[1][triangle];
+            const float r2 = view.depth[2][triangle];
+            const V inverse = hn::Div(hn::Set(d, 1), det);
+            const V depth =
+                depth_of(side, inverse, hn::Set(d, view.depth[0][triangle]), hn::Set(d, r1), hn::Set(d, r2));
+            V error = hn::Zero(d);
+            if constexpr (kExact) {
+                error = hn::MulAdd(hn::Mul(bound, hn::Abs(inverse)),
+                                   hn::Set(d, 8.5F * std::max(std::abs(r1), std::abs(r2))),
+                                   hn::Set(d, 0x1p-19F * view.size[triangle] + kTiny));
+            }
+            taken |= take(lane, {hn::Sub(depth, error), hn::Add(depth, error), inside}, inside, inside, place);
         }
         return taken;
     }
 
     /// One triangle against each ray from its own origin, as test_blocks has it.
     HWY_INLINE bool test_from_origins(size_t lane, uint32_t place) {
-        const float* corners = blocks_[place / kBlockSize].vertex[0][0] + place % kBlockSize;
+        const float* corners = corners_at(blocks_, place);
         const ShearedRay<V> own{focus_.x,
                                 focus_.y,
                                 focus_.z,
@@ -481,26 +501,25 @@ class Packet {
             return false;
         }
         const V(&z)[3] = seen.z;
-        return take(lane, seen.side, inwards, inside, bound, mz, z[0], hn::Sub(z[1], z[0]), hn::Sub(z[2], z[0]),
-                    is_reversed_ ? -focus_.sign : focus_.sign, place);
+        const DepthRange<V> range = depth_range<kExact>(seen.side, bound, mz, z[0], hn::Sub(z[1], z[0]),
+                                                        hn::Sub(z[2], z[0]), is_reversed_ ? -focus_.sign : focus_.sign);
+        const auto certain = kExact ? hn::And(range.is_sound, hn::Gt(inwards, bound)) : inside;
+        return take(lane, range, inside, certain, place);
     }
 
-    /// Takes in a triangle for the rays that meet it, as Stream does. Depths are as test_blocks has them.
-    HWY_INLINE bool take(size_t lane, const V (&side)[3], V inwards, hn::Mask<D> inside, V bound, V mz, V z0, V r1,
-                         V r2, float sign, uint32_t place) {
+    /// Takes in a triangle for the rays that may meet it, and those that meet it for certain, as Stream does.
+    HWY_INLINE bool take(size_t lane, const DepthRange<V>& depth, hn::Mask<D> inside, hn::Mask<D> certain,
+                         uint32_t place) {
         const uint32_t triangle = triangle_at(blocks_, place);
         const V reach = hn::Load(d, reaches_ + lane);
-        const DepthRange<V> depth = depth_range<kExact>(side, bound, mz, z0, r1, r2, sign);
         const V lower = depth.lower;
         const V upper = depth.upper;
-        const auto certain = kExact ? hn::And(depth.is_sound, hn::Gt(inwards, bound)) : inside;
-        const auto is_new = hn::Ne(hn::BitCast(du, hn::Load(du, triangle_ + lane)), hn::Set(du, triangle));
+        const V sure_before = hn::Load(d, sure_before_ + lane);
+        const auto is_new = hn::Ne(hn::Load(du, triangle_ + lane), hn::Set(du, triangle));
         const auto counts = hn::And(hn::And(inside, hn::RebindMask(d, is_new)),
                                     hn::And(hn::Le(lower, reach), hn::Ge(upper, hn::Load(d, start_ + lane))));
-        const auto in_range =
-            hn::And(hn::Ge(lower, hn::Load(d, sure_start_ + lane)), hn::Le(upper, hn::Load(d, sure_end_ + lane)));
-        const auto sure =
-            hn::And(hn::And(counts, certain), hn::And(in_range, hn::Lt(upper, hn::Load(d, lower_ + lane))));
+        const auto sure = hn::And(hn::And(counts, certain),
+                                  hn::And(hn::Ge(lower, hn::Load(d, sure_start_ + lane)), hn::Lt(upper, sure_before)));
         bool taken = !hn::AllFalse(d, sure);
         if (taken) {
             const auto sure_u = hn::RebindMask(du, sure);
@@ -513,7 +532,7 @@ class Packet {
                           box_reach_ + lane);
             } else {
                 const V shortened = hn::MulAdd(upper, hn::Set(d, 1 + 0x1p-20F), hn::Set(d, kTiny));
-                hn::Store(hn::IfThenElse(sure, lower, hn::Load(d, lower_ + lane)), d, lower_ + lane);
+                hn::Store(hn::IfThenElse(sure, lower, sure_before), d, sure_before_ + lane);
                 hn::Store(hn::IfThenElse(sure, shortened, reach), d, reaches_ + lane);
                 hn::Store(hn::IfThenElse(sure, shortened, reach), d, box_reach_ + lane);
             }
@@ -530,13 +549,13 @@ class Packet {
     }
 
     HWY_NOINLINE bool take_open(size_t lane, uint32_t triangle, uint32_t place) {
-        Nearest nearest{place_[lane], lower_[lane], 0};
+        Nearest nearest{place_[lane], 0, 0};
         if (!take_exactly(rays_[lane], blocks_, place, nearest)) {
             return false;
         }
         place_[lane] = place;
         triangle_[lane] = triangle;
-        lower_[lane] = nearest.lower;
+        sure_before_[lane] = std::min(sure_before_[lane], nearest.lower);
         reaches_[lane] = kAnyHit ? -1.0F : nearest.upper * (1 + 0x1p-20F) + kTiny;
         box_reach_[lane] = reaches_[lane];
         return true;
@@ -557,7 +576,8 @@ class Packet {
     alignas(64) float origin_[3][kRays], t_min_[kRays], t_max_[kRays];
     alignas(64) float inverse_[3][kRays], near_shift_[3][kRays], far_shift_[3][kRays];
     alignas(64) float own_slope_x_[kRays], own_slope_y_[kRays], slant_[kRays], off_x_[kRays], off_y_[kRays];
-    alignas(64) float start_[kRays], reaches_[kRays], sure_start_[kRays], sure_end_[kRays], lower_[kRays];
+    alignas(64) float start_[kRays], reaches_[kRays], sure_start_[kRays];
+    alignas(64) float sure_before_[kRays];  ///< a hit wholly before this is nearer than any so far, and than t_max
     alignas(64) float box_start_[kRays], box_reach_[kRays];
     alignas(64) uint32_t place_[kRays], triangle_[kRays];
     uint32_t places_[kCapacity];  ///< what is to be visited: node * kWidth + slot of its child

@@ -22,9 +22,10 @@
 HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
 
-/// Traces rays that belong together as packets and all others as a stream. Calls done(ray, place) for each.
-template <bool kAnyHit, bool kExact, class Done>
-HWY_INLINE void trace(const Tree& tree, std::span<const Ray> rays, const Done& done) {
+/// Traces rays that belong together as packets and all others as a stream. Calls ends.add(ray, place) for each, or
+/// ends.add(first, packet) for those of a packet.
+template <bool kAnyHit, bool kExact, class Ends>
+HWY_INLINE void trace(const Tree& tree, std::span<const Ray> rays, Ends& ends) {
     constexpr size_t kChunk = 4096;
     constexpr size_t kPacket = Packet<kAnyHit, kExact>::kRays;
     static_assert(kChunk % kPacket == 0 && kPacket % RayBatch::kSize == 0);
@@ -37,35 +38,41 @@ HWY_INLINE void trace(const Tree& tree, std::span<const Ray> rays, const Done& d
         for (size_t i = begin; i < end; i += kPacket) {
             if (i + kPacket <= end && packet.gather(&rays[i])) {
                 packet.trace();
-                for (size_t lane = 0; lane < kPacket; ++lane) {
-                    done(static_cast<uint32_t>(i + lane), packet.place(lane));
-                }
+                ends.add(static_cast<uint32_t>(i), packet);
             } else {
                 for (size_t first = i; first < std::min(i + kPacket, end); first += RayBatch::kSize) {
                     batches[count++] = static_cast<uint32_t>(first);
                 }
             }
         }
-        stream.run({batches, count}, [&](const StreamRay& ray) { done(ray.number, ray.place); });
+        stream.run({batches, count}, [&](const StreamRay& ray) { ends.add(ray.number, ray.place); });
     }
 }
 
 template <bool kExact>
 HWY_INLINE void intersect_all(const Tree& tree, std::span<const Ray> rays, std::span<Hit> hits) {
     FinishQueue<kExact> queue(tree.blocks.data(), rays, hits);
-    trace<false, kExact>(tree, rays, [&](uint32_t ray, uint32_t place) {
-        if (place == kNoPlace) {
-            hits[ray] = missed(rays[ray]);
-        } else {
-            queue.add(ray, place);
-        }
-    });
+    trace<false, kExact>(tree, rays, queue);
     queue.flush();
 }
 
+/// Notes which rays are blocked.
+template <bool kExact>
+struct BlockedRays {
+    std::span<uint8_t> results;
+
+    HWY_INLINE void add(uint32_t ray, uint32_t place) { results[ray] = place != kNoPlace ? 1 : 0; }
+    HWY_INLINE void add(uint32_t first, const Packet<true, kExact>& packet) {
+        for (uint32_t lane = 0; lane < Packet<true, kExact>::kRays; ++lane) {
+            add(first + lane, packet.place(lane));
+        }
+    }
+};
+
 template <bool kExact>
 HWY_INLINE void occluded_all(const Tree& tree, std::span<const Ray> rays, std::span<uint8_t> results) {
-    trace<true, kExact>(tree, rays, [&](uint32_t ray, uint32_t place) { results[ray] = place != kNoPlace ? 1 : 0; });
+    BlockedRays<kExact> blocked{results};
+    trace<true, kExact>(tree, rays, blocked);
 }
 
 }  // namespace espalier::HWY_NAMESPACE

@@ -37,6 +37,13 @@ HWY_INLINE uint32_t mask_bits(D d, M mask) {
     return static_cast<uint32_t>(bits);
 }
 
+/// The other way: of a mask of up to eight lanes.
+template <class D>
+HWY_INLINE hn::Mask<D> mask_of(D d, uint32_t bits) {
+    const uint64_t room = bits;  // Highway reads 8 bytes
+    return hn::LoadMaskBits(d, reinterpret_cast<const uint8_t*>(&room));
+}
+
 /// The larger of the sizes of two numbers.
 template <class V>
 HWY_INLINE V largest_of(V a, V b) {

@@ -118,6 +118,12 @@ struct DepthRange {
     hn::Mask<hn::DFromV<V>> is_sound;  ///< both are finite
 };
 
+/// z0 + (v r1 + w r2) / det, given the reciprocal of det.
+template <class V>
+HWY_INLINE V depth_of(const V (&side)[3], V inverse, V z0, V r1, V r2) {
+    return hn::MulAdd(hn::Mul(side[1], inverse), r1, hn::MulAdd(hn::Mul(side[2], inverse), r2, z0));
+}
+
 /// Of hits inside triangles whose edge functions are off by at most `bound`, whose first corners lie at z0 and the
 /// others r1 and r2 behind it, mz the largest |z|; sign: of the direction along z.
 ///
@@ -131,8 +137,7 @@ HWY_INLINE DepthRange<V> depth_range(const V (&side)[3], V bound, V mz, V z0, V 
     const hn::DFromV<V> d;
     const V det = hn::Add(side[0], hn::Add(side[1], side[2]));
     const V inverse = hn::Div(hn::Set(d, 1), det);
-    const V depth = hn::Mul(hn::MulAdd(hn::Mul(side[1], inverse), r1, hn::MulAdd(hn::Mul(side[2], inverse), r2, z0)),
-                            hn::Set(d, sign));
+    const V depth = hn::Mul(depth_of(side, inverse, z0, r1, r2), hn::Set(d, sign));
     if constexpr (!kExact) {
         return {depth, depth, hn::Eq(depth, depth)};
     }

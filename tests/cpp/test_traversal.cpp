@@ -3,7 +3,6 @@
 
 #include <algorithm>
 #include <bit>
-#include <cstring>
 #include <numeric>
 #include <random>
 
@@ -14,6 +13,13 @@
 
 namespace espalier {
 namespace {
+
+/// Bit for bit.
+bool is_same(const Hit& a, const Hit& b) {
+    return std::bit_cast<uint32_t>(a.t) == std::bit_cast<uint32_t>(b.t) &&
+           std::bit_cast<uint32_t>(a.u) == std::bit_cast<uint32_t>(b.u) &&
+           std::bit_cast<uint32_t>(a.v) == std::bit_cast<uint32_t>(b.v) && a.triangle == b.triangle;
+}
 
 /// The same triangles in a chain of nodes whose boxes are met by every ray: it tests them all, and nothing but the
 /// triangle test decides.
@@ -129,6 +135,39 @@ std::vector<Ray> make_coherent_rays(const Mesh& mesh, uint32_t seed) {
 }
 
 /// Packets, streams and single rays give the same hits bit for bit, in any number and order.
+TEST(Traversal, FinishesAPacketsHitsAsThoseOfSingleRays) {
+    constexpr int kRays = 32;
+    std::mt19937 random(5);
+    std::uniform_real_distribution<float> uniform(-1, 1);
+    const auto point = [&] { return Vec3f{uniform(random), uniform(random), uniform(random)}; };
+    uint32_t found = 0;
+    uint32_t different = 0;
+    for (int i = 0; i < 200; ++i) {
+        // So near its plane that double does not tell how near.
+        const Vec3f corner[3] = {point(), point(), point()};
+        const Vec3f focus = (corner[0] + corner[1] + corner[2]) * (1.0F / 3);
+        const Vec3f normal = cross(corner[1] - corner[0], corner[2] - corner[0]) * (i % 2 == 0 ? 1.0F : -1.0F);
+        const Mesh mesh{{corner[0].x, corner[0].y, corner[0].z, corner[1].x, corner[1].y, corner[1].z, corner[2].x,
+                         corner[2].y, corner[2].z},
+                        {0, 1, 2}};
+        std::vector<Ray> rays;
+        for (int k = 0; k < kRays; ++k) {
+            rays.push_back({focus, 0, normalize(normal) + point() * 0.01F, std::numeric_limits<float>::infinity()});
+        }
+        const Tree tree = build(mesh.soup(), {});
+        std::vector<Hit> together(kRays);
+        intersect(tree, rays, together);
+        for (size_t k = 0; k < kRays; ++k) {
+            Hit alone{};
+            intersect(tree, {&rays[k], 1}, {&alone, 1});
+            found += alone.triangle >= 0 ? 1U : 0U;
+            different += is_same(alone, together[k]) ? 0U : 1U;
+        }
+    }
+    EXPECT_GT(found, 1000U);
+    EXPECT_EQ(different, 0U);
+}
+
 TEST(Traversal, IsTheSameInAnyBatch) {
     Mesh far = make_sphere(24, 32);
     for (float& x : far.positions) {
@@ -143,11 +182,6 @@ TEST(Traversal, IsTheSameInAnyBatch) {
         std::vector<uint8_t> blocked(rays.size());
         intersect(tree, rays, hits);
         occluded(tree, rays, blocked);
-        const auto is_same = [](const Hit& a, const Hit& b) {
-            return std::bit_cast<uint32_t>(a.t) == std::bit_cast<uint32_t>(b.t) &&
-                   std::bit_cast<uint32_t>(a.u) == std::bit_cast<uint32_t>(b.u) &&
-                   std::bit_cast<uint32_t>(a.v) == std::bit_cast<uint32_t>(b.v) && a.triangle == b.triangle;
-        };
 
         size_t found = 0;
         size_t wrong_alone = 0;
