@@ -113,7 +113,8 @@ struct HitColumns {
                 hn::BlendedStore(value, lanes, df, to + first);
             }
         };
-        store(distance, t);
+        // A zero has no sign: that of the origin's zeros would show in it, and rays of a packet may differ in those.
+        store(hn::Add(distance, hn::Zero(d)), t);
         store(hn::Max(hn::Mul(dot(direction, equations.u_normal), scale), hn::Zero(d)), u);
         store(hn::Max(hn::Mul(dot(direction, equations.v_normal), scale), hn::Zero(d)), v);
         if constexpr (std::is_same_v<hn::TFromV<V>, double>) {

@@ -37,7 +37,7 @@ HWY_INLINE uint32_t mask_bits(D d, M mask) {
     return static_cast<uint32_t>(bits);
 }
 
-/// The other way: of a mask of up to eight lanes.
+/// The other way.
 template <class D>
 HWY_INLINE hn::Mask<D> mask_of(D d, uint32_t bits) {
     const uint64_t room = bits;  // Highway reads 8 bytes
