@@ -130,20 +130,20 @@ struct FocusView {
             const auto possible = hn::Ge(hn::Max(most_inside, hn::Neg(least_inside)),
                                          hn::Neg(hn::Mul(bound_here, hn::Set(d, 1 + 0x1p-10F))));
             const V sign = hn::Set(d, focus.sign);
-            const V depth_of[3] = {hn::Mul(z_of[0], sign), hn::Mul(z_of[1], sign), hn::Mul(z_of[2], sign)};
+            const V corner_depth[3] = {hn::Mul(z_of[0], sign), hn::Mul(z_of[1], sign), hn::Mul(z_of[2], sign)};
             const V room = hn::MulAdd(mz, hn::Set(d, 0x1p-20F), hn::Set(d, kTiny));
-            const V nearest = hn::Sub(hn::Min(depth_of[0], hn::Min(depth_of[1], depth_of[2])), room);
-            const V farthest = hn::Add(hn::Max(depth_of[0], hn::Max(depth_of[1], depth_of[2])), room);
+            const V nearest = hn::Sub(hn::Min(corner_depth[0], hn::Min(corner_depth[1], corner_depth[2])), room);
+            const V farthest = hn::Add(hn::Max(corner_depth[0], hn::Max(corner_depth[1], corner_depth[2])), room);
             const auto in_range = hn::And(hn::Le(nearest, hn::Set(d, reach)), hn::Ge(farthest, hn::Set(d, entry)));
             // Small triangles among wide rays are often parted from them by none of their own edges.
-            const V beside =
-                hn::Max(distance_beside(x, depth_of, focus.spread_x), distance_beside(y, depth_of, focus.spread_y));
+            const V beside = hn::Max(distance_beside(x, corner_depth, focus.spread_x),
+                                     distance_beside(y, corner_depth, focus.spread_y));
             const auto among = hn::Le(beside, hn::MulAdd(hn::Set(d, 2.0F), margin, hn::Set(d, kTiny)));
             reached |= mask_bits(d, hn::And(hn::And(possible, in_range), among)) << first;
             hn::Store(bound_here, d, bound + first);
-            hn::Store(depth_of[0], d, depth[0] + first);
-            hn::Store(hn::Sub(depth_of[1], depth_of[0]), d, depth[1] + first);
-            hn::Store(hn::Sub(depth_of[2], depth_of[0]), d, depth[2] + first);
+            hn::Store(corner_depth[0], d, depth[0] + first);
+            hn::Store(hn::Sub(corner_depth[1], corner_depth[0]), d, depth[1] + first);
+            hn::Store(hn::Sub(corner_depth[2], corner_depth[0]), d, depth[2] + first);
             hn::Store(mz, d, size + first);
         }
         return reached;

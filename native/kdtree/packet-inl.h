@@ -471,10 +471,10 @@ class Packet {
             V error = hn::Zero(d);
             if constexpr (kExact) {
                 error = hn::MulAdd(hn::Mul(bound, hn::Abs(inverse)),
-                                   hn::Set(d, 8.5F * std::max(std::abs(r1), std::abs(r2))),
-                                   hn::Set(d, 0x1p-19F * view.size[triangle] + kTiny));
+                                   hn::Set(d, kErrorOfWeights * std::max(std::abs(r1), std::abs(r2))),
+                                   hn::Set(d, kErrorOfRounding * view.size[triangle] + kTiny));
             }
-            taken |= take(lane, {hn::Sub(depth, error), hn::Add(depth, error), inside}, inside, inside, place);
+            taken |= take(lane, hn::Sub(depth, error), hn::Add(depth, error), inside, inside, place);
         }
         return taken;
     }
@@ -504,16 +504,14 @@ class Packet {
         const DepthRange<V> range = depth_range<kExact>(seen.side, bound, mz, z[0], hn::Sub(z[1], z[0]),
                                                         hn::Sub(z[2], z[0]), is_reversed_ ? -focus_.sign : focus_.sign);
         const auto certain = kExact ? hn::And(range.is_sound, hn::Gt(inwards, bound)) : inside;
-        return take(lane, range, inside, certain, place);
+        return take(lane, range.lower, range.upper, inside, certain, place);
     }
 
-    /// Takes in a triangle for the rays that may meet it, and those that meet it for certain, as Stream does.
-    HWY_INLINE bool take(size_t lane, const DepthRange<V>& depth, hn::Mask<D> inside, hn::Mask<D> certain,
-                         uint32_t place) {
+    /// Takes in a triangle, between these depths, for the rays that may meet it and those that meet it for certain, as
+    /// Stream does.
+    HWY_INLINE bool take(size_t lane, V lower, V upper, hn::Mask<D> inside, hn::Mask<D> certain, uint32_t place) {
         const uint32_t triangle = triangle_at(blocks_, place);
         const V reach = hn::Load(d, reaches_ + lane);
-        const V lower = depth.lower;
-        const V upper = depth.upper;
         const V sure_before = hn::Load(d, sure_before_ + lane);
         const auto is_new = hn::Ne(hn::Load(du, triangle_ + lane), hn::Set(du, triangle));
         const auto counts = hn::And(hn::And(inside, hn::RebindMask(d, is_new)),

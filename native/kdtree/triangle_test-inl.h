@@ -118,6 +118,11 @@ struct DepthRange {
     hn::Mask<hn::DFromV<V>> is_sound;  ///< both are finite
 };
 
+/// How far a depth may be off: per share of det that its error takes and depth between the corners, and per depth for
+/// rounding (see depth_range).
+constexpr float kErrorOfWeights = 8.5F;
+constexpr float kErrorOfRounding = 0x1p-19F;
+
 /// z0 + (v r1 + w r2) / det, given the reciprocal of det.
 template <class V>
 HWY_INLINE V depth_of(const V (&side)[3], V inverse, V z0, V r1, V r2) {
@@ -145,7 +150,8 @@ HWY_INLINE DepthRange<V> depth_range(const V (&side)[3], V bound, V mz, V z0, V 
     const V share = hn::Mul(bound, hn::Abs(inverse));
     const auto is_sound = hn::Le(share, hn::Set(d, 1.0F / 33));
     const V doubt = hn::Mul(share, largest_of(r1, r2));
-    const V error = hn::MulAdd(hn::Set(d, 8.5F), doubt, hn::MulAdd(hn::Set(d, 0x1p-19F), mz, hn::Set(d, kTiny)));
+    const V error =
+        hn::MulAdd(hn::Set(d, kErrorOfWeights), doubt, hn::MulAdd(hn::Set(d, kErrorOfRounding), mz, hn::Set(d, kTiny)));
     return {hn::IfThenElse(is_sound, hn::Sub(depth, error), hn::Set(d, -kInfinity)),
             hn::IfThenElse(is_sound, hn::Add(depth, error), hn::Set(d, kInfinity)), is_sound};
 }

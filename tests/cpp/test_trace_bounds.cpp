@@ -549,11 +549,11 @@ TEST_P(TraceBounds, OfTheFinishAreKept) {
     finished = 0;
     for (int i = 0; i < 4000; ++i) {
         const Vec3f direction{std::round(20 * centred()), std::round(20 * centred()), 11};
-        const float far = std::exp2(18 + 20 * random.fraction());
+        const float far = std::exp2(std::round(18 + 20 * random.fraction()));
         const Vec3f a = point();
         const Vec3f b = point();
         const Vec3f corner[3] = {a, b, -(a + b)};
-        judge({direction * -std::exp2(std::round(std::log2(far))), 0, direction, HUGE_VALF}, corner);
+        judge({direction * -far, 0, direction, HUGE_VALF}, corner);
     }
     EXPECT_GT(finished, 200U);
     // Rays from beside a corner that run along their triangle, so that its plane is met much farther away.
