@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 #pragma once
 
+#include <hwy/base.h>
+
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
@@ -32,7 +34,8 @@ struct Gap {
 
 /// The subtrees that one thread builds: nodes depth first, the tight box of each, and the triangles of the leaves in
 /// whole blocks. Child and block indices count from the beginning of these arrays. All three lie in one piece of
-/// memory, so that small trees touch few pages.
+/// memory, so that small trees touch few pages. What is called for every node is inlined by force (see
+/// build_kernels.h).
 class SubtreeOutput {
  public:
     SubtreeOutput() = default;
@@ -46,14 +49,14 @@ class SubtreeOutput {
     std::span<const uint32_t> triangles() const { return {triangles_, triangle_count_}; }
 
     /// Takes the place of an inner node, before its left child is written; returns its index.
-    size_t open_inner() {
+    HWY_INLINE size_t open_inner() {
         if (node_count_ == node_capacity_) {
             reserve(2 * node_capacity_ + 64, triangle_capacity_);
         }
         return node_count_++;
     }
     /// Fills it in when both children are there.
-    void close_inner(size_t index, Split split, size_t right_child) {
+    HWY_INLINE void close_inner(size_t index, Split split, size_t right_child) {
         nodes_[index] = KdNode::inner(split.axis, split.position, static_cast<uint32_t>(right_child));
         Box3f box = boxes_[index + 1];
         box.extend(boxes_[right_child]);
@@ -67,7 +70,7 @@ class SubtreeOutput {
     }
     const std::vector<Gap>& gaps() const { return gaps_; }
     /// Appends a leaf; returns the places of its triangles, whose last block is padded with kNoTriangle.
-    uint32_t* add_leaf(uint32_t references) {
+    HWY_INLINE uint32_t* add_leaf(uint32_t references) {
         const size_t index = open_inner();
         const size_t first = triangle_count_;
         const size_t room = size_t{block_count(references)} * kBlockSize;
@@ -83,13 +86,13 @@ class SubtreeOutput {
         return triangles_ + first;
     }
     /// Appends a leaf of these triangles, with its tight box.
-    void add_leaf(std::span<const uint32_t> triangles, const Box3f& box) {
+    HWY_INLINE void add_leaf(std::span<const uint32_t> triangles, const Box3f& box) {
         std::copy(triangles.begin(), triangles.end(), add_leaf(static_cast<uint32_t>(triangles.size())));
         last_box() = box;
     }
     Box3f& last_box() { return boxes_[node_count_ - 1]; }
     /// Takes back what was appended since the counts were these.
-    void rewind(size_t nodes, size_t triangles) {
+    HWY_INLINE void rewind(size_t nodes, size_t triangles) {
         node_count_ = nodes;
         triangle_count_ = triangles;
     }
