@@ -34,6 +34,10 @@ class BoxUnion {
             upper_[axis] = hn::Neg(hn::Inf(d));
         }
     }
+    HWY_INLINE void extend(int axis, V lower, V upper) {
+        lower_[axis] = hn::Min(lower_[axis], lower);
+        upper_[axis] = hn::Max(upper_[axis], upper);
+    }
     HWY_INLINE void extend(int axis, M which, V lower, V upper) {
         lower_[axis] = hn::IfThenElse(which, hn::Min(lower_[axis], lower), lower_[axis]);
         upper_[axis] = hn::IfThenElse(which, hn::Max(upper_[axis], upper), upper_[axis]);
@@ -219,6 +223,27 @@ inline uint32_t remove_references(const References& references, uint32_t count,
     return count - static_cast<uint32_t>(positions.size());
 }
 
+/// Appends a whole vector of references to a side that has `count` of them; what is there already is left alone.
+template <class D>
+HWY_INLINE void append_all(D d, const References& from, const References& to, uint32_t& count, BoxUnion<D>& tight) {
+    const hn::RebindToUnsigned<D> du;
+    const bool moves = to.triangle + count != from.triangle;
+    for (int axis = 0; axis < 3; ++axis) {
+        const auto b = static_cast<size_t>(axis);
+        const auto lower = hn::LoadU(d, from.lower[b]);
+        const auto upper = hn::LoadU(d, from.upper[b]);
+        tight.extend(axis, lower, upper);
+        if (moves) {
+            hn::StoreU(lower, d, to.lower[b] + count);
+            hn::StoreU(upper, d, to.upper[b] + count);
+        }
+    }
+    if (moves) {
+        hn::StoreU(hn::LoadU(du, from.triangle), du, to.triangle + count);
+    }
+    count += static_cast<uint32_t>(hn::Lanes(d));
+}
+
 inline Partition partition(const TriangleSoup& soup, const References& from, uint32_t count, Split split, bool clip,
                            const References& to_left_side, const References& to_right_side) {
     // Copies, so that the compiler knows that no store changes the pointers.
@@ -251,6 +276,15 @@ inline Partition partition(const TriangleSoup& soup, const References& from, uin
         const Compression compress_right(d, to_right);
         const uint64_t left_bits = compress_left.bits();
         const uint64_t right_bits = compress_right.bits();
+        // References keep the order of the mesh, in which neighbours often lie side by side.
+        if (size == lanes && right_bits == 0) {
+            append_all(d, in.at(i), left, left_count, left_tight);
+            return;
+        }
+        if (size == lanes && left_bits == 0) {
+            append_all(d, in.at(i), right, right_count, right_tight);
+            return;
+        }
         for (int axis = 0; axis < 3; ++axis) {
             const auto b = static_cast<size_t>(axis);
             const auto lower = hn::LoadU(d, in.lower[b] + i);
