@@ -28,7 +28,8 @@ class SubtreeBuilder {
     SubtreeBuilder(const SubtreeInput& input, SubtreeOutput& output) : input_(input), output_(output) {}
 
     /// Builds below a node whose references begin at `begin`; from `room` on there is space for right children.
-    void build(const OpenNode& node, size_t begin, size_t room) {
+    /// is_counted: the node is its parent without empty space, and no other node was searched since.
+    void build(const OpenNode& node, size_t begin, size_t room, bool is_counted = false) {
         const References references = at(begin);
         const BuildParameters& parameters = *input_.parameters;
         if (parameters.is_careful() && node.count <= CarefulNode::kCapacity) {
@@ -45,7 +46,7 @@ class SubtreeBuilder {
         if (input_.sharing != nullptr && input_.sharing->is_wanted()) {
             share();
         }
-        const Split split = search_(node, references);
+        const Split split = search_(node, references, is_counted);
         if (split.axis < 0) {
             output_.add_leaf({references.triangle, node.count}, node.tight);
             return;
@@ -53,7 +54,8 @@ class SubtreeBuilder {
         Partition parts;
         size_t right_begin = begin;
         size_t right_room = room;
-        if (parameters.search == Search::kAllEvents || !cuts_empty_space(node, split, parts)) {
+        const bool is_same = parameters.search != Search::kAllEvents && cuts_empty_space(node, split, parts);
+        if (!is_same) {
             if (room + node.count > input_.references->capacity()) {
                 build_elsewhere(node, references);
                 return;
@@ -68,7 +70,7 @@ class SubtreeBuilder {
 
         const size_t index = output_.open_inner();
         waiting_.push_back(&right);
-        build(left, begin, right_room);
+        build(left, begin, right_room, is_same);
         waiting_.pop_back();
         if (right.given != kNotGiven) {
             output_.close_inner_with_gap(index, split, right.given);
@@ -80,7 +82,7 @@ class SubtreeBuilder {
             right_room = room;
         }
         const size_t right_child = output_.node_count();
-        build(right.node, right_begin, right_room);
+        build(right.node, right_begin, right_room, is_same && left.count == 0);
         output_.close_inner(index, split, right_child);
     }
 

@@ -27,8 +27,10 @@ class SplitSearch {
  public:
     explicit SplitSearch(const BuildParameters& parameters) : parameters_(parameters) {}
 
-    Split operator()(const OpenNode& node, const References& references) {
-        return parameters_.search == Search::kAllEvents ? sweep_all(node, references) : narrow_down(node, references);
+    /// is_counted: the last call was for the same references, in a cell from which it cut empty space.
+    Split operator()(const OpenNode& node, const References& references, bool is_counted = false) {
+        return parameters_.search == Search::kAllEvents ? sweep_all(node, references)
+                                                        : narrow_down(node, references, is_counted);
     }
 
  private:
@@ -46,10 +48,12 @@ class SplitSearch {
     /// The cheapest plane between slices, then of thinner slices on both sides of it, then the cheapest event on both
     /// sides of that. Around the optimum the cost changes slowly, but jumps at events: many triangles of a scan begin
     /// and end at the same place.
-    Split narrow_down(const OpenNode& node, const References& references) {
-        BinCounts counts{};
-        count_bins(references, node.count, node.tight, counts);
-        Split split = choose_split(node, counts, parameters_);
+    Split narrow_down(const OpenNode& node, const References& references, bool is_counted) {
+        if (!is_counted) {
+            counts_ = {};
+            count_bins(references, node.count, node.tight, counts_);
+        }
+        Split split = choose_split(node, counts_, parameters_);
         Interval range;
         if (parameters_.search == Search::kSlices || !finer_range(node, split, range)) {
             return split;
@@ -65,6 +69,7 @@ class SplitSearch {
     }
 
     const BuildParameters& parameters_;
+    BinCounts counts_;
     EventSweep sweep_;
 };
 
