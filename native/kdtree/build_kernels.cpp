@@ -56,7 +56,7 @@ class SubtreeBuilder {
         size_t right_room = room;
         const bool is_same = parameters.search != Search::kAllEvents && cuts_empty_space(node, split, parts);
         if (!is_same) {
-            if (room + node.count > input_.references->capacity()) {
+            if (room + node.count > input_.room_end) {
                 build_elsewhere(node, references);
                 return;
             }
@@ -65,18 +65,18 @@ class SubtreeBuilder {
             right_room = room + parts.right_count;
         }
         OpenNode left;
-        Waiting right{{}, right_begin, kNotGiven};
+        Waiting right{{}, right_begin};
         open_children(node, split, parts, left, right.node);
 
         const size_t index = output_.open_inner();
         waiting_.push_back(&right);
         build(left, begin, right_room, is_same);
         waiting_.pop_back();
-        if (right.given != kNotGiven) {
+        if (right.given != SubtreeSharing::kNotGiven) {
             output_.close_inner_with_gap(index, split, right.given);
             return;
         }
-        if (right_begin != begin && right_room + right.node.count > input_.references->capacity()) {
+        if (right_begin != begin && right_room + right.node.count > input_.room_end) {
             copy_references(at(right_begin), right.node.count, references);  // the parent's place is free
             right_begin = begin;
             right_room = room;
@@ -87,7 +87,6 @@ class SubtreeBuilder {
     }
 
  private:
-    static constexpr uint32_t kNotGiven = 0xffffffffU;
     static constexpr uint32_t kLeastToGive =
         CarefulNode::kCapacity + 1;  ///< references, below which giving costs more than it gains
 
@@ -95,15 +94,15 @@ class SubtreeBuilder {
     struct Waiting {
         OpenNode node;
         size_t begin;
-        uint32_t given = kNotGiven;  ///< number of the subtree that it became
+        uint32_t given = SubtreeSharing::kNotGiven;  ///< number of the subtree that it became
     };
 
-    References at(size_t place) const { return input_.references->references().at(place); }
+    References at(size_t place) const { return input_.references.at(place); }
 
     /// Gives away the waiting node nearest to the root, which is the largest as a rule.
     void share() {
         for (Waiting* waiting : waiting_) {
-            if (waiting->given == kNotGiven && waiting->node.count >= kLeastToGive) {
+            if (waiting->given == SubtreeSharing::kNotGiven && waiting->node.count >= kLeastToGive) {
                 waiting->given = input_.sharing->give(waiting->node, at(waiting->begin));
                 return;
             }
@@ -114,8 +113,9 @@ class SubtreeBuilder {
     void build_elsewhere(const OpenNode& node, const References& references) {
         const ReferenceBuffer buffer(subtree_room(node.count));
         copy_references(references, node.count, buffer.references());
-        const SubtreeInput input{input_.soup, input_.parameters, input_.cancel, &buffer, nullptr};
-        SubtreeBuilder(input, output_).build(node, 0, node.count);
+        const SubtreeInput input{input_.soup, input_.parameters, input_.cancel,    nullptr, buffer.references(),
+                                 0,           node.count,        buffer.capacity()};
+        SubtreeBuilder(input, output_).build(node, input.begin, input.room);
     }
 
     const SubtreeInput& input_;
@@ -126,7 +126,7 @@ class SubtreeBuilder {
 };
 
 void build_subtree(const SubtreeInput& input, const OpenNode& node, SubtreeOutput& output) {
-    SubtreeBuilder(input, output).build(node, 0, node.count);
+    SubtreeBuilder(input, output).build(node, input.begin, input.room);
 }
 
 Split find_split(const OpenNode& node, const References& references, const BuildParameters& parameters) {

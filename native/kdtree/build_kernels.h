@@ -67,9 +67,12 @@ struct Partition {
 /// Where a thread that builds a subtree may give part of it to threads that have nothing to do.
 class SubtreeSharing {
  public:
+    static constexpr uint32_t kNotGiven = 0xffffffffU;
+
     virtual ~SubtreeSharing() = default;
     bool is_wanted() const { return idle_.load(std::memory_order_relaxed) > 0; }
-    /// Takes over a node and a copy of its references; returns the number of the new subtree.
+    /// Takes over a node and a copy of its references; returns the number of the new subtree, or kNotGiven where there
+    /// is no room for it.
     virtual uint32_t give(const OpenNode& node, const References& references) = 0;
 
  protected:
@@ -81,8 +84,11 @@ struct SubtreeInput {
     const TriangleSoup* soup;
     const BuildParameters* parameters;
     const std::atomic<bool>* cancel;
-    const ReferenceBuffer* references;  ///< the node's own, at the start; behind them is room for right children
-    SubtreeSharing* sharing;            ///< null where one thread builds alone
+    SubtreeSharing* sharing;  ///< null where one thread builds alone
+    References references;
+    size_t begin;     ///< place of the node's own among them
+    size_t room;      ///< from where there is space for right children
+    size_t room_end;  ///< and up to where
 };
 
 /// Room for a subtree's references, and for the right children that wait while left ones are built: rarely more than as

@@ -107,7 +107,8 @@ class Builder {
     /// One thread needs no top levels: all references in one piece, and one subtree.
     void make_references_alone(Subtrees& subtrees) {
         const uint32_t triangles = soup_.size();
-        ReferenceBuffer room(subtree_room(triangles), expected_block_bytes(triangles));
+        ReferenceBuffer room(subtree_room(triangles), most_block_bytes(triangles), usual_block_bytes(triangles));
+        room.memory().take_pages(0, usual_block_bytes(triangles));
         const uint32_t count = build_kernels().make_references(soup_, 0, triangles, room.references(), tree_.bounds,
                                                                tree_.report.rejected_faces);
         subtrees.add_whole({tree_.bounds, tree_.bounds, count, spare_references(triangles), 0}, std::move(room));

@@ -32,7 +32,7 @@ OnDemand::OnDemand(const TriangleSoup& soup, const BuildParameters& parameters, 
       top_(soup_, parameters_, cancel, threads),
       threads_(threads),
       whole_(std::max(kWhole, parameters.one_thread)),
-      memory_(size_t{2} * soup.size() + kWhole, 0),
+      memory_(size_t{2} * soup.size() + kWhole, 0, SIZE_MAX),
       most_parts_(most_parts(soup.size())),
       parts_(new Part[most_parts_]),
       most_blocks_(most_blocks(soup.size())) {}
@@ -51,9 +51,9 @@ void OnDemand::split_top(Tree& tree) {
     // From then on one node for each thread will do.
     top_.split_above(soup_.size() / static_cast<uint32_t>(threads_));
     // Only what is written takes memory. Inner nodes have two children at least, so there are no more of them.
-    const size_t expected = expected_block_bytes(soup_.size());
-    tree.wide_nodes = LargeBuffer<WideNode>(most_blocks_, expected / 8);
-    tree.blocks = LargeBuffer<TriangleBlock>(most_blocks_, expected);
+    const size_t usual = usual_block_bytes(soup_.size());
+    tree.wide_nodes = LargeBuffer<WideNode>(most_blocks_, usual / 8);
+    tree.blocks = LargeBuffer<TriangleBlock>(most_blocks_, usual);
     nodes_ = tree.wide_nodes.data();
     blocks_ = tree.blocks.data();
     lay_out(0);
@@ -247,7 +247,9 @@ uint32_t OnDemand::divide(const OpenNode& node, Scratch& scratch) {
 uint32_t OnDemand::build_whole(const OpenNode& node, Scratch& scratch) {
     SubtreeOutput& output = scratch.output;
     output.rewind(0, 0);
-    kernels_.build_subtree({&soup_, &parameters_, nullptr, &scratch.room, nullptr}, node, output);
+    const ReferenceBuffer& room = scratch.room;
+    kernels_.build_subtree({&soup_, &parameters_, nullptr, nullptr, room.references(), 0, node.count, room.capacity()},
+                           node, output);
     collapse_whole(output.nodes(), output.boxes(), output.triangle_count() / kBlockSize, scratch.wide);
     return append(scratch.wide, output.triangles());
 }

@@ -15,7 +15,7 @@ namespace espalier {
 namespace {
 
 /// Looks at a value this often before it goes to sleep over it.
-constexpr int kSpins = 4000;
+constexpr int kSpins = 40000;
 
 void pause_briefly() {
 #if defined(__x86_64__)

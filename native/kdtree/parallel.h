@@ -14,7 +14,8 @@ namespace espalier {
 /// Threads this process may run on at the same time, at least 1.
 int hardware_threads();
 
-/// Waits for a change, awake for a fraction of a millisecond: a build has barriers microseconds apart. Whoever makes
+/// Waits for a change, awake for two milliseconds or so: a build has barriers microseconds apart, and a thread that
+/// sleeps takes 50 to wake. Whoever makes
 /// the change calls notify_all.
 void wait_while_equal(const std::atomic<uint32_t>& value, uint32_t old);
 

@@ -48,10 +48,11 @@ class ReferenceBuffer {
     static constexpr size_t kSlack = 64;
 
     ReferenceBuffer() = default;
-    /// With address space for at least `later_bytes`, which the memory may be reused for.
-    explicit ReferenceBuffer(size_t capacity, size_t later_bytes = 0)
+    /// With address space for at least `later_bytes`, which the memory may be reused for, and huge pages for so much as
+    /// is usually used.
+    explicit ReferenceBuffer(size_t capacity, size_t later_bytes = 0, size_t usual_bytes = SIZE_MAX)
         : stride_((capacity + kSlack + 15) / 16 * 16 + 16),
-          memory_(std::max(stride_ * kArrays, later_bytes / sizeof(uint32_t))) {
+          memory_(std::max(stride_ * kArrays, later_bytes / sizeof(uint32_t)), usual_bytes) {
         for (size_t axis = 0; axis < 3; ++axis) {
             references_.lower[axis] = reinterpret_cast<float*>(memory_.data() + stride_ * axis);
             references_.upper[axis] = reinterpret_cast<float*>(memory_.data() + stride_ * (axis + 3));

@@ -11,22 +11,65 @@ namespace espalier {
 void Subtrees::add_whole(const OpenNode& root, ReferenceBuffer references) {
     Subtree& subtree = subtrees_.emplace_back();
     subtree.root = root;
-    subtree.references = std::move(references);
+    own_references_ = std::move(references);
+    references_ = own_references_.references();
+    rooms_.push_back({root.count, own_references_.capacity()});
     waiting_.push_back(&subtree);
 }
 
-void Subtrees::add_below(const TopLevels& top) {
+void Subtrees::add_below(TopLevels& top) {
     for (const TopNode& node : top.nodes()) {
         if (!node.is_split()) {
             Subtree& subtree = subtrees_.emplace_back();
             subtree.root = node.node;
             subtree.top = &node;
             waiting_.push_back(&subtree);
-            room_ = std::max(room_, subtree_room(node.node.count));
         }
     }
     std::stable_sort(waiting_.begin(), waiting_.end(),
                      [](const Subtree* a, const Subtree* b) { return a->root.count > b->root.count; });
+    gather_all(top);
+}
+
+/// Lays the references of each subtree side by side behind those of the top levels, whose places then become rooms.
+void Subtrees::gather_all(TopLevels& top) {
+    constexpr size_t kMargin = ReferenceBuffer::kSlack;
+    const auto threads = static_cast<size_t>(threads_);
+    size_t count = 0;
+    for (const Subtree& subtree : subtrees_) {
+        count += subtree.root.count + kMargin;
+    }
+    const auto [memory, used] = top.memory();
+    size_t place = used;
+    size_t first_room = 0;
+    size_t room = used / threads;
+    references_ = memory.references();
+    if (used + count > memory.capacity()) {
+        room = subtree_room(waiting_.front()->root.count);
+        own_references_ = ReferenceBuffer(count + threads * room);
+        references_ = own_references_.references();
+        place = 0;
+        first_room = count;
+    }
+    for (size_t i = 0; i < threads; ++i) {
+        rooms_.push_back({first_room + i * room, first_room + (i + 1) * room - kMargin});
+    }
+    struct Copy {
+        const Segment* from;
+        size_t to;
+    };
+    std::vector<Copy> copies;
+    for (Subtree& subtree : subtrees_) {
+        subtree.begin = place;
+        for (const Segment& segment : subtree.top->segments) {
+            copies.push_back({&segment, place});
+            place += segment.count;
+        }
+        place += kMargin;
+    }
+    parallel_for(threads_, copies.size(), [&](size_t i) {
+        copy_references(copies[i].from->references, copies[i].from->count, references_.at(copies[i].to));
+    });
 }
 
 void Subtrees::build() {
@@ -35,7 +78,7 @@ void Subtrees::build() {
         try {
             while (Subtree* subtree = take()) {
                 build_one(*subtree, worker);
-                finish_one();
+                finish(*subtree);
             }
         } catch (...) {
             const std::lock_guard lock(mutex_);
@@ -64,6 +107,11 @@ Subtrees::Subtree* Subtrees::take() {
             if (!waiting_.empty()) {
                 Subtree* next = waiting_.front();
                 waiting_.pop_front();
+                if (next->space == 0) {  // nothing is given while such a one waits, so that there is a room
+                    next->room = rooms_.back();
+                    next->space = next->room.begin;
+                    rooms_.pop_back();
+                }
                 return next;
             }
             if (!is_idle) {
@@ -75,8 +123,9 @@ Subtrees::Subtree* Subtrees::take() {
     }
 }
 
-void Subtrees::finish_one() {
+void Subtrees::finish(const Subtree& subtree) {
     const std::lock_guard lock(mutex_);
+    rooms_.push_back(subtree.room);
     if (--unfinished_ == 0) {
         changes_.fetch_add(1, std::memory_order_release);
         changes_.notify_all();
@@ -84,12 +133,22 @@ void Subtrees::finish_one() {
 }
 
 uint32_t Subtrees::give(const OpenNode& node, const References& references) {
-    ReferenceBuffer own(subtree_room(node.count));
-    copy_references(references, node.count, own.references());
+    Room room{};
+    {
+        const std::lock_guard lock(mutex_);
+        if (rooms_.empty() || rooms_.back().end - rooms_.back().begin < subtree_room(node.count)) {
+            return kNotGiven;
+        }
+        room = rooms_.back();
+        rooms_.pop_back();
+    }
+    copy_references(references, node.count, references_.at(room.begin));
     const std::lock_guard lock(mutex_);
     Subtree& subtree = subtrees_.emplace_back();
     subtree.root = node;
-    subtree.references = std::move(own);
+    subtree.begin = room.begin;
+    subtree.space = room.begin + node.count;
+    subtree.room = room;
     waiting_.push_back(&subtree);
     ++unfinished_;
     changes_.fetch_add(1, std::memory_order_release);
@@ -98,16 +157,7 @@ uint32_t Subtrees::give(const OpenNode& node, const References& references) {
 }
 
 void Subtrees::build_one(Subtree& subtree, int worker) {
-    const auto w = static_cast<size_t>(worker);
-    const ReferenceBuffer* room = &subtree.references;
-    if (subtree.top != nullptr) {
-        if (rooms_[w].references().triangle == nullptr) {
-            rooms_[w] = ReferenceBuffer(room_);
-        }
-        gather(*subtree.top, rooms_[w].references());
-        room = &rooms_[w];
-    }
-    SubtreeOutput& output = outputs_[w];
+    SubtreeOutput& output = outputs_[static_cast<size_t>(worker)];
     if (output.nodes().data() == nullptr) {
         output = SubtreeOutput(soup_.size() / static_cast<uint32_t>(threads_));
     }
@@ -116,13 +166,12 @@ void Subtrees::build_one(Subtree& subtree, int worker) {
     subtree.first_triangle = output.triangle_count();
     subtree.first_gap = output.gaps().size();
     SubtreeSharing* sharing = threads_ > 1 ? this : nullptr;
-    build_kernels().build_subtree({&soup_, &parameters_, cancel_, room, sharing}, subtree.root, output);
+    build_kernels().build_subtree(
+        {&soup_, &parameters_, cancel_, sharing, references_, subtree.begin, subtree.space, subtree.room.end},
+        subtree.root, output);
     subtree.node_end = output.node_count();
     subtree.triangle_end = output.triangle_count();
     subtree.gap_end = output.gaps().size();
-    if (threads_ > 1) {
-        subtree.references = {};
-    }
 }
 
 void Subtrees::compact(TopLevels* top, Tree& tree) {
@@ -143,7 +192,7 @@ void Subtrees::compact(TopLevels* top, Tree& tree) {
     if (nodes > (1U << 30) || triangles / kBlockSize > kMaxBlocks) {
         throw std::length_error("the tree needs more nodes or blocks than its indices can count");
     }
-    LargeBuffer<uint32_t> references = top != nullptr ? top->take_memory() : subtrees_[0].references.take_memory();
+    LargeBuffer<uint32_t> references = top != nullptr ? top->take_memory() : own_references_.take_memory();
     tree.blocks = std::move(references).reuse_for<TriangleBlock>(triangles / kBlockSize);
     tree.nodes = LargeBuffer<KdNode>(nodes);
     if (top == nullptr) {
@@ -152,8 +201,8 @@ void Subtrees::compact(TopLevels* top, Tree& tree) {
         triangles_ = outputs_[0].triangles();
         return;
     }
-    joined_boxes_ = rooms_.front().take_memory().reuse_for<Box3f>(nodes);
-    joined_triangles_ = rooms_.back().take_memory().reuse_for<uint32_t>(triangles);
+    joined_boxes_ = LargeBuffer<Box3f>(nodes);
+    joined_triangles_ = LargeBuffer<uint32_t>(triangles);
     parallel_for(threads_, subtrees_.size(), [&](size_t i) { copy(subtrees_[i], tree); });
     write_top(*top, 0, tree);
     for (const Subtree& subtree : subtrees_) {

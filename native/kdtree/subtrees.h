@@ -21,13 +21,12 @@ class Subtrees : public SubtreeSharing {
           parameters_(parameters),
           cancel_(cancel),
           threads_(threads),
-          outputs_(static_cast<size_t>(threads)),
-          rooms_(static_cast<size_t>(threads)) {}
+          outputs_(static_cast<size_t>(threads)) {}
 
     /// One subtree that is the whole tree, built where its references lie.
     void add_whole(const OpenNode& root, ReferenceBuffer references);
-    /// A subtree for each node that the top levels left unsplit.
-    void add_below(const TopLevels& top);
+    /// A subtree for each node that the top levels left unsplit, its references in one piece.
+    void add_below(TopLevels& top);
 
     /// Phase 3.
     void build();
@@ -43,10 +42,18 @@ class Subtrees : public SubtreeSharing {
     uint32_t give(const OpenNode& node, const References& references) override;
 
  private:
+    /// Places among the references where a thread may build.
+    struct Room {
+        size_t begin;
+        size_t end;
+    };
+
     struct Subtree {
         OpenNode root;
-        const TopNode* top = nullptr;  ///< whose segments hold the references; null if they lie in `references`
-        ReferenceBuffer references;
+        const TopNode* top = nullptr;  ///< null for the whole tree and for what was given by a thread
+        size_t begin = 0;              ///< of its references
+        size_t space = 0;              ///< for right children, to the end of the room
+        Room room{};                   ///< none before a thread takes the subtree, but for given ones
         // Where the thread that built it put it:
         int worker = 0;
         size_t first_node = 0;
@@ -62,8 +69,9 @@ class Subtrees : public SubtreeSharing {
         size_t triangle_place_end = 0;
     };
 
+    void gather_all(TopLevels& top);
     Subtree* take();
-    void finish_one();
+    void finish(const Subtree& subtree);
     void build_one(Subtree& subtree, int worker);
     std::span<const Gap> gaps(const Subtree& subtree) const;
     void place(Subtree& subtree, size_t& nodes, size_t& triangles);
@@ -84,11 +92,12 @@ class Subtrees : public SubtreeSharing {
     std::deque<Subtree*> waiting_;
     size_t unfinished_ = 0;
     bool is_abandoned_ = false;
-    std::atomic<uint32_t> changes_{0};  ///< of the four above
+    std::vector<Room> rooms_;           ///< in which nothing is built
+    std::atomic<uint32_t> changes_{0};  ///< of the five above
 
+    References references_;
+    ReferenceBuffer own_references_;      ///< where they do not lie in the memory of the top levels
     std::vector<SubtreeOutput> outputs_;  ///< per thread
-    std::vector<ReferenceBuffer> rooms_;  ///< per thread
-    size_t room_ = 0;                     ///< references that each of them holds
 
     std::vector<Subtree*> of_top_;    ///< per top node; null where the node is split
     std::vector<size_t> top_places_;  ///< per top node

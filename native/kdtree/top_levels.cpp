@@ -48,14 +48,18 @@ TopLevels::TopLevels(const TriangleSoup& soup, const BuildParameters& parameters
       threads_(threads),
       kernels_(build_kernels()),
       segment_size_(choose_segment_size(soup.size(), threads)),
-      memory_(size_t{2} * soup.size() + 2 * with_slack(segment_size_), expected_block_bytes(soup.size())) {}
+      memory_(size_t{5} * soup.size() / 2 + 2 * with_slack(segment_size_), most_block_bytes(soup.size()),
+              usual_block_bytes(soup.size())),
+      scratch_(static_cast<size_t>(threads)) {}
 
 void TopLevels::make_references() {
     const uint32_t triangles = soup_.size();
     const size_t count = (triangles + segment_size_ - 1) / segment_size_;
     // Every thread takes pages of its own: two that first wrote to one page at the same time would both clear it.
-    const size_t huge_pages = expected_block_bytes(triangles) / 2 / LargeBuffer<uint32_t>::kHugePage + 1;
-    parallel_for(threads_, huge_pages, [&](size_t i) { memory_.first().take_huge_page(i); });
+    constexpr size_t kPages = LargeBuffer<uint32_t>::kHugePage;
+    const size_t bytes = usual_block_bytes(triangles);
+    parallel_for(threads_, bytes / kPages + 1,
+                 [&](size_t i) { memory_.first().memory().take_pages(i * kPages, std::min(bytes, (i + 1) * kPages)); });
 
     std::vector<Box3f> bounds(count);
     std::vector<RejectedFaces> rejected(count);
@@ -173,7 +177,6 @@ Partition TopLevels::partition_segment(const TopNode& top, const Segment& segmen
 }
 
 std::vector<uint32_t> TopLevels::open_level(const std::vector<uint32_t>& level, const std::vector<Part>& parts) {
-    std::vector<ReferenceBuffer> scratch(static_cast<size_t>(threads_));
     std::vector<Partition> results(parts.size());
     std::vector<Segment> left(parts.size());
     std::vector<Segment> right(parts.size());
@@ -183,7 +186,7 @@ std::vector<uint32_t> TopLevels::open_level(const std::vector<uint32_t>& level, 
         if (!top.is_split() || cuts_empty_space(top.node, top.split, whole)) {
             return;
         }
-        ReferenceBuffer& mine = scratch[static_cast<size_t>(worker)];
+        ReferenceBuffer& mine = scratch_[static_cast<size_t>(worker)];
         if (mine.references().triangle == nullptr) {
             mine = ReferenceBuffer(with_slack(segment_size_) * size_t{2});
         }

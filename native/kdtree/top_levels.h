@@ -19,9 +19,13 @@ struct Segment {
 /// Memory for segments, handed out to any thread.
 class SegmentMemory {
  public:
-    SegmentMemory(size_t capacity, size_t later_bytes) { buffers_.emplace_back(capacity, later_bytes); }
+    SegmentMemory(size_t capacity, size_t later_bytes, size_t usual_bytes) {
+        buffers_.emplace_back(capacity, later_bytes, usual_bytes);
+    }
     References take(uint32_t count);
-    LargeBuffer<uint32_t>& first() { return buffers_.front().memory(); }
+    ReferenceBuffer& first() { return buffers_.front(); }
+    /// References of the first buffer that were handed out: all of them if there is another one.
+    size_t used() const { return buffers_.size() == 1 ? used_ : buffers_.front().capacity(); }
     LargeBuffer<uint32_t> take_memory() { return buffers_.front().take_memory(); }
 
  private:
@@ -44,6 +48,12 @@ struct TopNode {
 /// Copies a node's references into one piece.
 void gather(const TopNode& node, const References& to);
 
+/// References in one piece of memory, and how many of its places are in use.
+struct UsedReferences {
+    const ReferenceBuffer& buffer;
+    size_t used;
+};
+
 /// Phases 1 and 2: the references and the top of the tree, all threads on one level at a time.
 class TopLevels {
  public:
@@ -57,6 +67,8 @@ class TopLevels {
 
     const std::vector<TopNode>& nodes() const { return nodes_; }
     const RejectedFaces& rejected() const { return rejected_; }
+    /// Where most or all references are.
+    UsedReferences memory() { return {memory_.first(), memory_.used()}; }
     /// Gives away the memory of the references, for when they are no longer needed.
     LargeBuffer<uint32_t> take_memory() { return memory_.take_memory(); }
 
@@ -85,12 +97,15 @@ class TopLevels {
     const uint32_t segment_size_;
     SegmentMemory memory_;
     std::vector<TopNode> nodes_;
-    std::vector<BinCounts> counts_;  ///< per part
+    std::vector<BinCounts> counts_;         ///< per part
+    std::vector<ReferenceBuffer> scratch_;  ///< per thread
     RejectedFaces rejected_;
 };
 
-/// What the triangle blocks of most trees stay below: the memory of the references becomes theirs.
-inline size_t expected_block_bytes(uint32_t triangles) { return size_t{160} * triangles; }
+/// What the triangle blocks of all but strange trees stay below: the memory of the references becomes theirs.
+inline size_t most_block_bytes(uint32_t triangles) { return size_t{160} * triangles; }
+/// What they usually take.
+inline size_t usual_block_bytes(uint32_t triangles) { return size_t{72} * triangles; }
 
 /// Room for the splits of the whole tree to add references, however hostile the scene: 6 for each triangle.
 inline uint64_t spare_references(uint32_t triangles) { return uint64_t{6} * triangles + 1024; }
