@@ -25,6 +25,7 @@ enum class Search {
 struct BuildParameters {
     SahConstants sah;
     Search search;
+    bool arrange;         ///< whether the references of a leaf are sorted such that those of its parts lie together
     bool clip;            ///< whether straddlers' boxes are cut to the part of the triangle on each side
     uint32_t small_node;  ///< a node of at most so many references is finished as bit masks (see small_node-inl.h)
     uint32_t one_thread;  ///< a node of at most so many references is left to one thread, which may try its events

@@ -35,13 +35,13 @@ BuildParameters parameters_of(Quality quality) {
     switch (quality) {
         case Quality::kDraft:
             sah.block = sah.traversal / 2;  // two blocks are a leaf without a search
-            return {sah, Search::kFinerSlices, false, 256, 256};
+            return {sah, Search::kFinerSlices, false, false, 256, 256};
         case Quality::kBalanced:
-            return {sah, Search::kFinerSlices, true, 256, 256};
+            return {sah, Search::kFinerSlices, true, true, 256, 256};
         case Quality::kBest:
-            return {sah, Search::kEvents, true, 56, 1U << 14};
+            return {sah, Search::kEvents, true, true, 56, 1U << 14};
         case Quality::kExact:
-            return {sah, Search::kAllEvents, true, 0, std::numeric_limits<uint32_t>::max()};
+            return {sah, Search::kAllEvents, true, true, 0, std::numeric_limits<uint32_t>::max()};
     }
     throw std::invalid_argument("no such quality");
 }

@@ -3,6 +3,8 @@
 
 #include <algorithm>
 #include <array>
+#include <cmath>
+#include <utility>
 #include <vector>
 
 #include "kdtree/build_kernels.h"
@@ -25,18 +27,24 @@ struct Run {
 
 uint32_t run_length(size_t nodes) { return static_cast<uint32_t>(std::max<size_t>(512, nodes / 256)); }
 
-/// Something that may become a child of a wide node: a kd node, or part of a kd leaf too large for one child.
+/// Something that may become a child of a wide node: a kd node, or part of a kd leaf.
 struct Item {
     uint32_t node;
     uint32_t first_block;  ///< of a leaf
     uint32_t blocks;       ///< of a leaf; 0 for an inner node
+    uint32_t part;         ///< of a leaf: where the boxes of its parts begin
     float area;
     Box3f box;
+
+    void set_box(const Box3f& new_box) {
+        box = new_box;
+        area = half_area(new_box);
+    }
 };
 
 class Collapse {
  public:
-    Collapse(std::span<const KdNode> nodes, std::span<const Box3f> boxes) : nodes_(nodes), boxes_(boxes) {}
+    Collapse(std::span<const KdNode> nodes, const TightBoxes& boxes) : nodes_(nodes), boxes_(boxes) {}
 
     /// Appends the wide node for a kd node and all below it; returns its index. A kd node listed in `runs` is not
     /// entered: its child code is the index of its run, marked for the caller to resolve.
@@ -47,10 +55,10 @@ class Collapse {
  private:
     Item item(uint32_t node) const {
         const KdNode kd = nodes_[node];
-        const Box3f& box = boxes_[node];
-        Item made{node, 0, 0, half_area(box), box};
+        Item made{node, 0, 0, 0, 0, {}};
+        made.set_box(boxes_.nodes[node]);
         if (kd.is_leaf()) {
-            made.first_block = kd.first_block();
+            made.first_block = made.part = kd.first_block();
             made.blocks = block_count(kd.references());
         }
         return made;
@@ -79,6 +87,7 @@ class Collapse {
             }
             open(items, count, slot, order);
         }
+        cut_leaves(items, count, order);
 
         const uint32_t index = out.add();
         WideNode& made = out.data()[index];
@@ -130,6 +139,7 @@ class Collapse {
             Item second = opened;
             second.first_block += first.blocks;
             second.blocks -= first.blocks;
+            second.part = second.first_block;
             items[static_cast<size_t>(slot)] = first;
             items[static_cast<size_t>(count)] = second;
         } else {
@@ -148,8 +158,64 @@ class Collapse {
         ++count;
     }
 
+    /// The two parts of a leaf of three to kMaxLeafBlocks blocks.
+    std::pair<Item, Item> parts(const Item& leaf) const {
+        Item first = leaf;
+        first.blocks = first_blocks(leaf.blocks);
+        first.part = leaf.part + 1;
+        first.set_box(boxes_.parts[leaf.part]);
+        Item second = leaf;
+        second.first_block += first.blocks;
+        second.blocks -= first.blocks;
+        const uint32_t slot = first.part + part_count(first.blocks);
+        second.part = slot + 1;
+        second.set_box(boxes_.parts[slot]);
+        return {first, second};
+    }
+
+    /// What a leaf costs the rays that meet the node, where two blocks are tested at a time, and to get there takes
+    /// half as long as that.
+    static float cost(const Item& leaf) { return leaf.area * (1 + 2 * static_cast<float>((leaf.blocks + 1) / 2)); }
+
+    float gain_by_cutting(const Item& item) const {
+        if (item.blocks < 3) {
+            return 0;
+        }
+        const auto [first, second] = parts(item);
+        return cost(item) - (cost(first) + cost(second));
+    }
+
+    /// Gives places that are left over to parts of the leaves that gain most by it.
+    void cut_leaves(std::array<Item, WideNode::kWidth>& items, int& count, ChildOrder& order) const {
+        std::array<float, WideNode::kWidth> gains{};
+        std::transform(items.begin(), items.begin() + count, gains.begin(),
+                       [&](const Item& item) { return gain_by_cutting(item); });
+        while (count < WideNode::kWidth) {
+            const auto slot = static_cast<size_t>(std::max_element(gains.begin(), gains.end()) - gains.begin());
+            if (gains[slot] <= 0) {
+                return;
+            }
+            auto [low, high] = parts(items[slot]);
+            const Vec3f apart = (high.box.lower + high.box.upper) - (low.box.lower + low.box.upper);
+            int axis = 0;
+            for (int other = 1; other < 3; ++other) {
+                axis = std::abs(apart[other]) > std::abs(apart[axis]) ? other : axis;
+            }
+            if (apart[axis] < 0) {
+                std::swap(low, high);
+            }
+            const auto added = static_cast<size_t>(count);
+            items[slot] = low;
+            items[added] = high;
+            gains[slot] = gain_by_cutting(low);
+            gains[added] = gain_by_cutting(high);
+            order.split(axis, static_cast<int>(slot), count);
+            ++count;
+        }
+    }
+
     std::span<const KdNode> nodes_;
-    std::span<const Box3f> boxes_;
+    const TightBoxes& boxes_;
 };
 
 /// Lists the runs below a node in depth-first order.
@@ -171,8 +237,8 @@ size_t most_nodes(size_t nodes, size_t blocks) { return nodes + blocks / (WideNo
 
 }  // namespace
 
-void collapse_whole(std::span<const KdNode> nodes, std::span<const Box3f> boxes, size_t blocks, WideNodes& out) {
-    const size_t most = most_nodes(nodes.size(), blocks);
+void collapse_whole(std::span<const KdNode> nodes, const TightBoxes& boxes, WideNodes& out) {
+    const size_t most = most_nodes(nodes.size(), boxes.parts.size());
     if (out.capacity() < most) {
         out = WideNodes(2 * most, most / 8);
     }
@@ -180,8 +246,8 @@ void collapse_whole(std::span<const KdNode> nodes, std::span<const Box3f> boxes,
     Collapse(nodes, boxes).collapse(0, out, nullptr);
 }
 
-void build_layout(const TriangleSoup& soup, std::span<const Box3f> boxes, std::span<const uint32_t> triangles,
-                  int threads, Tree& tree) {
+void build_layout(const TriangleSoup& soup, const TightBoxes& boxes, std::span<const uint32_t> triangles, int threads,
+                  Tree& tree) {
     constexpr size_t kBlocksPerTask = 512;
     const size_t blocks = triangles.size() / kBlockSize;
     const auto nodes = static_cast<uint32_t>(tree.nodes.size());

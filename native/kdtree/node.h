@@ -22,6 +22,14 @@ constexpr size_t kMaxBlocks = (size_t{1} << 26) - kMaxUnopened;
 /// Blocks that hold `references` triangles.
 constexpr uint32_t block_count(uint32_t references) { return (references + kBlockSize - 1) / kBlockSize; }
 
+/// A leaf of three blocks and more consists of two parts that rays may visit one without the other, and so does each
+/// part: so many blocks come first. An even number, since two blocks are tested at a time.
+constexpr uint32_t first_blocks(uint32_t blocks) { return (blocks / 2 + 1) / 2 * 2; }
+
+/// Parts that a leaf, or a part of one, with so many blocks is made of, the parts of its parts among them. There are
+/// fewer of them than blocks.
+constexpr uint32_t part_count(uint32_t blocks) { return blocks == 0 ? 0 : (blocks + 1) / 2 * 2 - 2; }
+
 /// A kd-tree node in 8 bytes, as in pbrt. Nodes lie depth first: the left child right behind its parent.
 class KdNode {
  public:

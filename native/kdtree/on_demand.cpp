@@ -250,7 +250,7 @@ uint32_t OnDemand::build_whole(const OpenNode& node, Scratch& scratch) {
     const ReferenceBuffer& room = scratch.room;
     kernels_.build_subtree({&soup_, &parameters_, nullptr, nullptr, room.references(), 0, node.count, room.capacity()},
                            node, output);
-    collapse_whole(output.nodes(), output.boxes(), output.triangle_count() / kBlockSize, scratch.wide);
+    collapse_whole(output.nodes(), output.boxes(), scratch.wide);
     return append(scratch.wide, output.triangles());
 }
 

@@ -13,6 +13,7 @@
 
 #include <hwy/highway.h>
 
+#include <array>
 #include <bit>
 #include <cstring>
 
@@ -42,6 +43,7 @@ template <size_t kWords>
 class SmallNode {
  public:
     static constexpr uint32_t kCapacity = 32 * kWords;
+    static constexpr int kSteps = 64;
 
     HWY_INLINE SmallNode(const References& references, const OpenNode& node, const BuildParameters& parameters,
                          SubtreeOutput& output)
@@ -54,7 +56,7 @@ class SmallNode {
             const auto a = static_cast<size_t>(axis);
             place_planes(axis, node.count, references.lower[a], references.upper[a], node.tight);
         }
-        store_boxes(references, node.count);
+        store_boxes(references, node);
         Members<kWords> all;
         for (uint32_t w = 0; w < kWords; ++w) {
             const uint32_t left = node.count > 32 * w ? node.count - 32 * w : 0;
@@ -122,15 +124,32 @@ class SmallNode {
         }
     }
 
-    /// The boxes reference by reference, upper bounds negated: a union is two minima.
-    HWY_INLINE void store_boxes(const References& references, uint32_t count) {
+    /// The boxes reference by reference, upper bounds negated: a union is two minima. And the middles of the boxes, in
+    /// steps along each side of the node.
+    HWY_INLINE void store_boxes(const References& references, const OpenNode& node) {
         const hn::CappedTag<float, 16> d;
-        for (uint32_t i = 0; i < count; i += static_cast<uint32_t>(hn::Lanes(d))) {
+        const hn::Rebind<int8_t, decltype(d)> d8;
+        const hn::RebindToSigned<decltype(d)> di;
+        const auto lanes = static_cast<uint32_t>(hn::Lanes(d));
+        for (uint32_t i = 0; i < node.count; i += lanes) {
             hn::StoreInterleaved4(hn::LoadU(d, references.lower[0] + i), hn::LoadU(d, references.lower[1] + i),
                                   hn::LoadU(d, references.lower[2] + i), hn::Zero(d), d, lowers_[i]);
             hn::StoreInterleaved4(hn::Neg(hn::LoadU(d, references.upper[0] + i)),
                                   hn::Neg(hn::LoadU(d, references.upper[1] + i)),
                                   hn::Neg(hn::LoadU(d, references.upper[2] + i)), hn::Zero(d), d, uppers_[i]);
+        }
+        for (int axis = 0; axis < 3; ++axis) {
+            const auto a = static_cast<size_t>(axis);
+            const float low = node.tight.lower[axis];
+            const float high = node.tight.upper[axis];
+            const auto origin = hn::Set(d, low + low);
+            const auto scale = hn::Set(d, Slices::can_be_cut(low, high) ? 0.5F * kSteps / (high - low) : 0.0F);
+            for (uint32_t i = 0; i < node.count; i += lanes) {
+                const auto twice =
+                    hn::Add(hn::LoadU(d, references.lower[a] + i), hn::LoadU(d, references.upper[a] + i));
+                const auto step = truncate(di, hn::Mul(hn::Sub(twice, origin), scale));
+                hn::StoreU(hn::DemoteTo(d8, hn::Min(step, hn::Set(di, kSteps - 1))), d8, middles_[a] + i);
+            }
         }
     }
 
@@ -225,27 +244,145 @@ class SmallNode {
     }
 
     HWY_INLINE void write_leaf(const Members<kWords>& members, const OpenNode& node) {
-        uint32_t* next = output_.add_leaf(node.count);
+        const SubtreeOutput::Leaf leaf = output_.add_leaf(node.count);
+        if (node.count == 0) {
+            *leaf.box = Box3f{};
+            return;
+        }
+        LeafWriter writer{{}, {}, leaf.triangles, leaf.part_boxes};
+        for (int axis = 0; axis < 3; ++axis) {
+            writer.lower[axis] = node.cell.lower[axis] - reach_[axis];
+            writer.negated_upper[axis] = -(node.cell.upper[axis] + reach_[axis]);
+        }
+        const Vec3f size = node.cell.size();
+        const uint32_t whole = parameters_.arrange ? 2 : kCapacity / kBlockSize;
+        *leaf.box = box(write_part(members, node.count, {size.x, size.y, size.z}, whole, writer));
+        if (!parameters_.arrange) {
+            std::fill_n(leaf.part_boxes, part_count(block_count(node.count)), *leaf.box);
+        }
+    }
+
+    /// A leaf that is being written: the cell that bounds its boxes, and where triangles and boxes of parts go.
+    struct LeafWriter {
+        alignas(16) float lower[4];
+        alignas(16) float negated_upper[4];
+        uint32_t* triangles;
+        Box3f* boxes;
+    };
+
+    /// A box in vectors, the upper bounds negated.
+    struct Bounds {
+        hn::Vec<hn::Full128<float>> lower;
+        hn::Vec<hn::Full128<float>> negated_upper;
+    };
+    static HWY_INLINE Box3f box(Bounds bounds) {
         const hn::Full128<float> d;
-        auto lower = hn::Inf(d);
-        auto upper = hn::Inf(d);
+        alignas(16) float lower[4];
+        alignas(16) float upper[4];
+        hn::Store(bounds.lower, d, lower);
+        hn::Store(hn::Sub(hn::Zero(d), bounds.negated_upper), d, upper);
+        return {{lower[0], lower[1], lower[2]}, {upper[0], upper[1], upper[2]}};
+    }
+
+    /// Appends a part of a leaf, whose size is about this, and the boxes of its own parts, if it has more than `whole`
+    /// blocks; returns its bounds.
+    Bounds write_part(const Members<kWords>& members, uint32_t count, std::array<float, 3> size, uint32_t whole,
+                      LeafWriter& writer) const {
+        const hn::Full128<float> d;
+        const uint32_t blocks = block_count(count);
+        if (blocks <= whole) {
+            auto lower = hn::Inf(d);
+            auto negated_upper = hn::Inf(d);
+            uint8_t places[kCapacity + 8];
+            list(members, places);
+            for (uint32_t i = 0; i < count; ++i) {
+                const size_t place = places[i];
+                writer.triangles[i] = triangles_[place];
+                lower = hn::Min(lower, hn::Load(d, lowers_[place]));
+                negated_upper = hn::Min(negated_upper, hn::Load(d, uppers_[place]));
+            }
+            writer.triangles += count;
+            return {hn::Add(hn::Max(lower, hn::Load(d, writer.lower)), hn::Zero(d)),
+                    hn::Max(negated_upper, hn::Load(d, writer.negated_upper))};
+        }
+        const size_t axis = size[0] >= std::max(size[1], size[2]) ? 0 : size[1] >= size[2] ? 1 : 2;
+        size[axis] *= 0.5F;
+        const uint32_t first_count = first_blocks(blocks) * kBlockSize;
+        const Members<kWords> first_members = lowest(members, axis, first_count);
+        Members<kWords> others;
         for (size_t w = 0; w < kWords; ++w) {
-            for (uint32_t rest = members.word[w]; rest != 0; rest &= rest - 1) {
-                const size_t i = 32 * w + static_cast<size_t>(std::countr_zero(rest));
-                *next++ = triangles_[i];
-                lower = hn::Min(lower, hn::Load(d, lowers_[i]));
-                upper = hn::Min(upper, hn::Load(d, uppers_[i]));
+            others.word[w] = members.word[w] & ~first_members.word[w];
+        }
+        Box3f* first_box = writer.boxes++;
+        const Bounds first = write_part(first_members, first_count, size, whole, writer);
+        *first_box = box(first);
+        Box3f* second_box = writer.boxes++;
+        const Bounds second = write_part(others, count - first_count, size, whole, writer);
+        *second_box = box(second);
+        return {hn::Min(first.lower, second.lower), hn::Min(first.negated_upper, second.negated_upper)};
+    }
+
+    /// The members' places, in order; what follows them does not matter. Eight are written at a time whatever the
+    /// number of bits, since how often a loop runs could not be foreseen (Langdale and Lemire 2019, section 3.1.1).
+    static HWY_INLINE void list(const Members<kWords>& members, uint8_t* places) {
+        for (size_t w = 0; w < kWords; w += 2) {
+            uint64_t rest = uint64_t{members.word[w + 1]} << 32 | members.word[w];
+            const int bits = std::popcount(rest);
+            int i = 0;
+            do {
+                for (const int end = i + 8; i < end; ++i, rest &= rest - 1) {
+                    places[i] = static_cast<uint8_t>(32 * w + static_cast<size_t>(std::countr_zero(rest)));
+                }
+            } while (i < bits);
+            places += bits;
+        }
+    }
+
+    /// So many of the references, those whose middles come first along an axis.
+    HWY_INLINE Members<kWords> lowest(const Members<kWords>& members, size_t axis, uint32_t wanted) const {
+        int limit = 0;
+        for (int step = kSteps / 8; step != 0; step /= 8) {
+            int few_enough = 0;
+            for (int k = 1; k < 8; ++k) {
+                uint32_t below = 0;
+                for_each_below(members, axis, limit + k * step,
+                               [&](size_t, uint64_t bits) { below += static_cast<uint32_t>(std::popcount(bits)); });
+                few_enough += below <= wanted ? 1 : 0;
+            }
+            limit += few_enough * step;
+        }
+        // Of those at the limit, the first.
+        Members<kWords> chosen;
+        const auto store = [](Members<kWords>& to) {
+            return [&to](size_t first, uint64_t bits) {
+                constexpr size_t kBytes = hn::MaxLanes(hn::CappedTag<int8_t, 64>()) / 8;
+                std::memcpy(reinterpret_cast<std::byte*>(to.word) + first / 8, &bits, kBytes);
+            };
+        };
+        for_each_below(members, axis, limit, store(chosen));
+        Members<kWords> next;
+        for_each_below(members, axis, limit + 1, store(next));
+        uint32_t missing = wanted - chosen.count();
+        for (size_t w = 0; missing != 0; ++w) {
+            for (uint32_t rest = next.word[w] & ~chosen.word[w]; rest != 0 && missing != 0; --missing) {
+                chosen.word[w] |= rest & -rest;
+                rest &= rest - 1;
             }
         }
-        alignas(16) float box[2][4];
-        hn::Store(lower, d, box[0]);
-        hn::Store(upper, d, box[1]);
-        Box3f tight;
-        for (int axis = 0; axis < 3; ++axis) {
-            tight.lower[axis] = std::max(box[0][axis], node.cell.lower[axis] - reach_[axis]) + 0.0F;
-            tight.upper[axis] = std::min(-box[1][axis], node.cell.upper[axis] + reach_[axis]) + 0.0F;
+        return chosen;
+    }
+
+    /// Calls f(first, bits) for the members among as many references as a vector has bytes, of those whose middles lie
+    /// below a limit.
+    template <class F>
+    HWY_INLINE void for_each_below(const Members<kWords>& members, size_t axis, int limit, const F& f) const {
+        const hn::CappedTag<int8_t, 64> d;
+        for (size_t i = 0; i < kCapacity; i += hn::Lanes(d)) {
+            const auto is_below = hn::Lt(hn::Load(d, middles_[axis] + i), hn::Set(d, static_cast<int8_t>(limit)));
+            uint64_t own = 0;
+            std::memcpy(&own, reinterpret_cast<const std::byte*>(members.word) + i / 8, hn::MaxLanes(d) / 8);
+            f(i, mask_bits(d, is_below) & own);
         }
-        output_.last_box() = node.count == 0 ? Box3f{} : tight;
     }
 
     const BuildParameters& parameters_;
@@ -260,6 +397,7 @@ class SmallNode {
     alignas(64) PlaneMasks right_;
     alignas(64) float lowers_[kCapacity][4];
     alignas(64) float uppers_[kCapacity][4];
+    alignas(64) int8_t middles_[3][kCapacity];
 };
 
 /// Finishes a node of at most parameters.small_node references; returns the cost of what was built.

@@ -32,20 +32,29 @@ struct Gap {
     uint32_t subtree;  ///< which belongs there
 };
 
+/// Boxes of what lies in the nodes, and in the parts of leaves (see node.h): of the first part, of all parts of that,
+/// and likewise of the second, from the place on that is the number of the leaf's first block.
+struct TightBoxes {
+    std::span<const Box3f> nodes;
+    std::span<const Box3f> parts;
+};
+
 /// The subtrees that one thread builds: nodes depth first, the tight box of each, and the triangles of the leaves in
-/// whole blocks. Child and block indices count from the beginning of these arrays. All three lie in one piece of
-/// memory, so that small trees touch few pages. What is called for every node is inlined by force (see
-/// build_kernels.h).
+/// whole blocks, with as many boxes for parts of leaves. Child and block indices count from the beginning of these
+/// arrays. All lie in one piece of memory, so that small trees touch few pages. What is called for every node is
+/// inlined by force (see build_kernels.h).
 class SubtreeOutput {
  public:
     SubtreeOutput() = default;
     /// With room for what so many references usually become.
-    explicit SubtreeOutput(size_t references) { reserve(references / 2 + 64, 3 * references + 1024); }
+    explicit SubtreeOutput(size_t references) {
+        reserve(references / 2 + 64, 3 * references / kBlockSize * kBlockSize + 1024);
+    }
 
     size_t node_count() const { return node_count_; }
     size_t triangle_count() const { return triangle_count_; }
     std::span<const KdNode> nodes() const { return {nodes_, node_count_}; }
-    std::span<const Box3f> boxes() const { return {boxes_, node_count_}; }
+    TightBoxes boxes() const { return {{boxes_, node_count_}, {part_boxes_, triangle_count_ / kBlockSize}}; }
     std::span<const uint32_t> triangles() const { return {triangles_, triangle_count_}; }
 
     /// Takes the place of an inner node, before its left child is written; returns its index.
@@ -69,8 +78,13 @@ class SubtreeOutput {
         gaps_.push_back({index, node_count_, triangle_count_, subtree});
     }
     const std::vector<Gap>& gaps() const { return gaps_; }
-    /// Appends a leaf; returns the places of its triangles, whose last block is padded with kNoTriangle.
-    HWY_INLINE uint32_t* add_leaf(uint32_t references) {
+    /// What a new leaf leaves to be filled in.
+    struct Leaf {
+        uint32_t* triangles;  ///< of which the last block is padded with kNoTriangle
+        Box3f* part_boxes;
+        Box3f* box;
+    };
+    HWY_INLINE Leaf add_leaf(uint32_t references) {
         const size_t index = open_inner();
         const size_t first = triangle_count_;
         const size_t room = size_t{block_count(references)} * kBlockSize;
@@ -83,14 +97,16 @@ class SubtreeOutput {
         nodes_[index] = KdNode::leaf(static_cast<uint32_t>(first / kBlockSize), references);
         triangle_count_ += room;
         std::fill(triangles_ + first + references, triangles_ + triangle_count_, kNoTriangle);
-        return triangles_ + first;
+        return {triangles_ + first, part_boxes_ + first / kBlockSize, boxes_ + index};
     }
-    /// Appends a leaf of these triangles, with its tight box.
+    /// Appends a leaf of these triangles, whose parts are not told apart.
     HWY_INLINE void add_leaf(std::span<const uint32_t> triangles, const Box3f& box) {
-        std::copy(triangles.begin(), triangles.end(), add_leaf(static_cast<uint32_t>(triangles.size())));
-        last_box() = box;
+        const auto count = static_cast<uint32_t>(triangles.size());
+        const Leaf leaf = add_leaf(count);
+        std::copy(triangles.begin(), triangles.end(), leaf.triangles);
+        std::fill_n(leaf.part_boxes, block_count(count), box);
+        *leaf.box = box;
     }
-    Box3f& last_box() { return boxes_[node_count_ - 1]; }
     /// Takes back what was appended since the counts were these.
     HWY_INLINE void rewind(size_t nodes, size_t triangles) {
         node_count_ = nodes;
@@ -99,16 +115,21 @@ class SubtreeOutput {
 
  private:
     void reserve(size_t nodes, size_t triangles) {
-        const size_t bytes = nodes * (sizeof(KdNode) + sizeof(Box3f)) + triangles * sizeof(uint32_t);
+        const size_t blocks = triangles / kBlockSize;
+        const size_t bytes =
+            nodes * (sizeof(KdNode) + sizeof(Box3f)) + blocks * (kBlockSize * sizeof(uint32_t) + sizeof(Box3f));
         LargeBuffer<std::byte> memory(bytes);
         auto* new_nodes = reinterpret_cast<KdNode*>(memory.data());
         auto* new_boxes = reinterpret_cast<Box3f*>(new_nodes + nodes);
-        auto* new_triangles = reinterpret_cast<uint32_t*>(new_boxes + nodes);
+        auto* new_part_boxes = new_boxes + nodes;
+        auto* new_triangles = reinterpret_cast<uint32_t*>(new_part_boxes + blocks);
         std::copy_n(nodes_, node_count_, new_nodes);
         std::copy_n(boxes_, node_count_, new_boxes);
+        std::copy_n(part_boxes_, triangle_count_ / kBlockSize, new_part_boxes);
         std::copy_n(triangles_, triangle_count_, new_triangles);
         nodes_ = new_nodes;
         boxes_ = new_boxes;
+        part_boxes_ = new_part_boxes;
         triangles_ = new_triangles;
         node_capacity_ = nodes;
         triangle_capacity_ = triangles;
@@ -117,6 +138,7 @@ class SubtreeOutput {
 
     KdNode* nodes_ = nullptr;
     Box3f* boxes_ = nullptr;
+    Box3f* part_boxes_ = nullptr;
     uint32_t* triangles_ = nullptr;
     size_t node_count_ = 0;
     size_t triangle_count_ = 0;

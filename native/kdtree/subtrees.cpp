@@ -202,13 +202,14 @@ void Subtrees::compact(TopLevels* top, Tree& tree) {
         return;
     }
     joined_boxes_ = LargeBuffer<Box3f>(nodes);
+    joined_part_boxes_ = LargeBuffer<Box3f>(triangles / kBlockSize);
     joined_triangles_ = LargeBuffer<uint32_t>(triangles);
     parallel_for(threads_, subtrees_.size(), [&](size_t i) { copy(subtrees_[i], tree); });
     write_top(*top, 0, tree);
     for (const Subtree& subtree : subtrees_) {
         close_gaps(subtree, tree);
     }
-    boxes_ = joined_boxes_.span();
+    boxes_ = {joined_boxes_.span(), joined_part_boxes_.span()};
     triangles_ = joined_triangles_.span();
 }
 
@@ -277,11 +278,12 @@ void Subtrees::copy(const Subtree& subtree, Tree& tree) {
                 to = KdNode::inner(from.axis(), from.split(), static_cast<uint32_t>(right_place));
             }
         }
-        std::copy(output.boxes().begin() + static_cast<std::ptrdiff_t>(node),
-                  output.boxes().begin() + static_cast<std::ptrdiff_t>(node_end), joined_boxes_.data() + place);
-        std::copy(output.triangles().begin() + static_cast<std::ptrdiff_t>(triangle),
-                  output.triangles().begin() + static_cast<std::ptrdiff_t>(triangle_end),
-                  joined_triangles_.data() + triangle_place);
+        const auto [boxes, part_boxes] = output.boxes();
+        std::copy_n(boxes.data() + node, node_end - node, joined_boxes_.data() + place);
+        std::copy_n(part_boxes.data() + triangle / kBlockSize, (triangle_end - triangle) / kBlockSize,
+                    joined_part_boxes_.data() + triangle_place / kBlockSize);
+        std::copy_n(output.triangles().data() + triangle, triangle_end - triangle,
+                    joined_triangles_.data() + triangle_place);
     };
     for (const Gap& gap : gaps(subtree)) {
         copy_up_to(gap.node, gap.triangle);

@@ -34,8 +34,8 @@ class Subtrees : public SubtreeSharing {
     /// for a whole tree.
     void compact(TopLevels* top, Tree& tree);
 
-    /// After compaction: tight, per node.
-    std::span<const Box3f> boxes() const { return boxes_; }
+    /// After compaction.
+    const TightBoxes& boxes() const { return boxes_; }
     /// After compaction: kBlockSize face indices per block.
     std::span<const uint32_t> triangles() const { return triangles_; }
 
@@ -102,8 +102,9 @@ class Subtrees : public SubtreeSharing {
     std::vector<Subtree*> of_top_;    ///< per top node; null where the node is split
     std::vector<size_t> top_places_;  ///< per top node
     LargeBuffer<Box3f> joined_boxes_;
+    LargeBuffer<Box3f> joined_part_boxes_;
     LargeBuffer<uint32_t> joined_triangles_;
-    std::span<const Box3f> boxes_;
+    TightBoxes boxes_;
     std::span<const uint32_t> triangles_;
 };
 

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <cstring>
 #include <functional>
 #include <thread>
@@ -8,6 +9,7 @@
 #include "kdtree/candidate.h"
 #include "kdtree/size_class.h"
 #include "kdtree/traversal.h"
+#include "kdtree/wide_nodes.h"
 #include "meshes.h"
 
 namespace espalier {
@@ -224,6 +226,42 @@ TEST(Tree, ReportAddsUp) {
     EXPECT_LE(sum, report.build_ms);
     EXPECT_GT(sum, 0.9 * report.build_ms);
     EXPECT_NE(report.checksum, build(make_sphere(60, 91).soup(), {Quality::kBalanced, 2}).report.checksum);
+}
+
+TEST(Tree, LeavesComeInPartsThatLieApart) {
+    const Mesh mesh = make_sphere(60, 90);
+    const auto area_in_parts = [&](Quality quality) {
+        const Tree tree = build(mesh.soup(), {quality, 2});
+        std::vector<std::pair<uint32_t, Box3f>> parts;
+        for_each_leaf(tree, [&](uint32_t first, uint32_t, const Box3f& box) { parts.emplace_back(first, box); });
+        std::sort(parts.begin(), parts.end(), [](const auto& a, const auto& b) { return a.first < b.first; });
+        double whole = 0;
+        double cut = 0;
+        for (const KdNode& node : tree.nodes.span()) {
+            if (!node.is_leaf() || node.references() == 0) {
+                continue;
+            }
+            const auto begins = [](const auto& part, uint32_t block) { return part.first < block; };
+            const uint32_t end = node.first_block() + block_count(node.references());
+            auto part = std::lower_bound(parts.begin(), parts.end(), node.first_block(), begins);
+            const auto last = std::lower_bound(part, parts.end(), end, begins);
+            if (last - part > 1) {
+                Box3f all;
+                for (; part != last; ++part) {
+                    cut += half_area(part->second);
+                    all.extend(part->second);
+                }
+                whole += half_area(all);
+            }
+        }
+        return std::pair(whole, cut);
+    };
+    EXPECT_EQ(area_in_parts(Quality::kDraft).first, 0);  // where the time to sort them is saved
+    for (const Quality quality : {Quality::kBalanced, Quality::kBest}) {
+        const auto [whole, cut] = area_in_parts(quality);
+        EXPECT_GT(whole, 1);
+        EXPECT_LT(cut, 1.6 * whole);
+    }
 }
 
 TEST(Tree, TakesMeshesOfAlmostNothing) {
