@@ -201,16 +201,18 @@ void Subtrees::compact(TopLevels* top, Tree& tree) {
         triangles_ = outputs_[0].triangles();
         return;
     }
-    joined_boxes_ = LargeBuffer<Box3f>(nodes);
-    joined_part_boxes_ = LargeBuffer<Box3f>(triangles / kBlockSize);
-    joined_triangles_ = LargeBuffer<uint32_t>(triangles);
+    const size_t boxes = nodes + triangles / kBlockSize;
+    joined_ = LargeBuffer<Box3f>(boxes + triangles * sizeof(uint32_t) / sizeof(Box3f) + 1);
+    joined_boxes_ = {joined_.data(), nodes};
+    joined_part_boxes_ = {joined_.data() + nodes, triangles / kBlockSize};
+    joined_triangles_ = {reinterpret_cast<uint32_t*>(joined_.data() + boxes), triangles};
     parallel_for(threads_, subtrees_.size(), [&](size_t i) { copy(subtrees_[i], tree); });
     write_top(*top, 0, tree);
     for (const Subtree& subtree : subtrees_) {
         close_gaps(subtree, tree);
     }
-    boxes_ = {joined_boxes_.span(), joined_part_boxes_.span()};
-    triangles_ = joined_triangles_.span();
+    boxes_ = {joined_boxes_, joined_part_boxes_};
+    triangles_ = joined_triangles_;
 }
 
 std::span<const Gap> Subtrees::gaps(const Subtree& subtree) const {

@@ -101,9 +101,10 @@ class Subtrees : public SubtreeSharing {
 
     std::vector<Subtree*> of_top_;    ///< per top node; null where the node is split
     std::vector<size_t> top_places_;  ///< per top node
-    LargeBuffer<Box3f> joined_boxes_;
-    LargeBuffer<Box3f> joined_part_boxes_;
-    LargeBuffer<uint32_t> joined_triangles_;
+    LargeBuffer<Box3f> joined_;       ///< the boxes of nodes and parts, and the triangles
+    std::span<Box3f> joined_boxes_;
+    std::span<Box3f> joined_part_boxes_;
+    std::span<uint32_t> joined_triangles_;
     TightBoxes boxes_;
     std::span<const uint32_t> triangles_;
 };

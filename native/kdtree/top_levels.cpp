@@ -48,8 +48,8 @@ TopLevels::TopLevels(const TriangleSoup& soup, const BuildParameters& parameters
       threads_(threads),
       kernels_(build_kernels()),
       segment_size_(choose_segment_size(soup.size(), threads)),
-      memory_(size_t{5} * soup.size() / 2 + 2 * with_slack(segment_size_), most_block_bytes(soup.size()),
-              usual_block_bytes(soup.size())),
+      memory_(size_t{5} * soup.size() / 2 + size_t{2} * with_slack(segment_size_) * static_cast<size_t>(threads + 1),
+              most_block_bytes(soup.size()), usual_block_bytes(soup.size())),
       scratch_(static_cast<size_t>(threads)) {}
 
 void TopLevels::make_references() {
@@ -164,7 +164,10 @@ Partition TopLevels::partition_segment(const TopNode& top, const Segment& segmen
                                                segment.references, scratch);
     const uint32_t both = parts.left_count + parts.right_count;
     if (both + 2 * kMargin <= segment.capacity) {
-        const uint32_t left_capacity = parts.left_count + (segment.capacity - both) / 2;
+        // What is free goes to both by their size: many a split takes but little off a node.
+        const uint64_t free = segment.capacity - both - 2 * kMargin;
+        const uint32_t left_capacity =
+            parts.left_count + kMargin + static_cast<uint32_t>(free * parts.left_count / std::max(both, 1U));
         left = {segment.references, parts.left_count, left_capacity};
         right = {segment.references.at(left_capacity), parts.right_count, segment.capacity - left_capacity};
     } else {
@@ -186,11 +189,11 @@ std::vector<uint32_t> TopLevels::open_level(const std::vector<uint32_t>& level, 
         if (!top.is_split() || cuts_empty_space(top.node, top.split, whole)) {
             return;
         }
-        ReferenceBuffer& mine = scratch_[static_cast<size_t>(worker)];
-        if (mine.references().triangle == nullptr) {
-            mine = ReferenceBuffer(with_slack(segment_size_) * size_t{2});
+        References& mine = scratch_[static_cast<size_t>(worker)];
+        if (mine.triangle == nullptr) {
+            mine = memory_.take(2 * with_slack(segment_size_));
         }
-        results[i] = partition_segment(top, top.segments[parts[i].segment], mine.references(), left[i], right[i]);
+        results[i] = partition_segment(top, top.segments[parts[i].segment], mine, left[i], right[i]);
     });
 
     std::vector<uint32_t> next;

@@ -97,8 +97,8 @@ class TopLevels {
     const uint32_t segment_size_;
     SegmentMemory memory_;
     std::vector<TopNode> nodes_;
-    std::vector<BinCounts> counts_;         ///< per part
-    std::vector<ReferenceBuffer> scratch_;  ///< per thread
+    std::vector<BinCounts> counts_;    ///< per part
+    std::vector<References> scratch_;  ///< per thread
     RejectedFaces rejected_;
 };
 
