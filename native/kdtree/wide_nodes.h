@@ -3,7 +3,6 @@
 
 #include <algorithm>
 #include <array>
-#include <bit>
 #include <cstddef>
 #include <cstdint>
 #include <span>
@@ -42,16 +41,20 @@ class ChildOrder {
     /// A child gives way to two: the one below a plane of `axis` takes its slot, the other slot `added`. The near one
     /// comes first in each octant, and everything nearer moves up by one.
     void split(int axis, int slot, int added) {
-        for (unsigned octant = 0; octant < 8; ++octant) {
-            const bool left_is_nearer = (octant >> axis & 1U) == 0;
-            const auto near = static_cast<uint32_t>(left_is_nearer ? slot : added);
-            const auto far = static_cast<uint32_t>(left_is_nearer ? added : slot);
-            // The lowest nibble that equals the slot.
-            const uint32_t differing = order_[octant] ^ (static_cast<uint32_t>(slot) * 0x11111111U);
-            const int shift = std::countr_zero((differing - 0x11111111U) & ~differing & 0x88888888U) - 3;
-            const uint32_t farther = order_[octant] & ((1U << shift) - 1);
-            const auto nearer = static_cast<uint32_t>(uint64_t{order_[octant]} >> (shift + 4) << (shift + 8));
-            order_[octant] = nearer | (near << (shift + 4)) | (far << shift) | farther;
+        const auto first = static_cast<uint32_t>(slot);
+        const uint32_t both = first ^ static_cast<uint32_t>(added);
+        for (uint32_t octant = 0; octant < 8; ++octant) {  // a vector operation each, as the compiler does it
+            const uint32_t order = order_[octant];
+            const uint32_t near = first ^ (both & (0U - (octant >> axis & 1U)));
+            const uint32_t far = near ^ both;
+            // The highest bit of the lowest nibble that equals the slot, and units of that nibble and the next.
+            const uint32_t differing = order ^ (first * 0x11111111U);
+            const uint32_t equal = (differing - 0x11111111U) & ~differing & 0x88888888U;
+            const uint32_t found = equal & (0U - equal);
+            const uint32_t unit = found >> 3;
+            const uint32_t next_unit = found << 1;
+            const uint32_t nearer = (order & (0U - next_unit)) << 4;
+            order_[octant] = nearer | near * next_unit | far * unit | (order & (unit - 1));
         }
     }
 
