@@ -175,7 +175,10 @@ class Collapse {
 
     /// What a leaf costs the rays that meet the node, where two blocks are tested at a time, and to get there takes
     /// half as long as that.
-    static float cost(const Item& leaf) { return leaf.area * (1 + 2 * static_cast<float>((leaf.blocks + 1) / 2)); }
+    static float cost(const Item& leaf) {
+        const uint32_t steps = (leaf.blocks + 1) / 2;
+        return leaf.area * (1 + 2 * static_cast<float>(steps));
+    }
 
     float gain_by_cutting(const Item& item) const {
         if (item.blocks < 3) {

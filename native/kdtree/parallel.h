@@ -15,8 +15,7 @@ namespace espalier {
 int hardware_threads();
 
 /// Waits for a change, awake for two milliseconds or so: a build has barriers microseconds apart, and a thread that
-/// sleeps takes 50 to wake. Whoever makes
-/// the change calls notify_all.
+/// sleeps takes 50 to wake. Whoever makes the change calls notify_all.
 void wait_while_equal(const std::atomic<uint32_t>& value, uint32_t old);
 
 /// Runs body(context, worker) once for each worker in [0, threads), worker 0 being the calling thread, and returns when
