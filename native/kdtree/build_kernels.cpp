@@ -99,12 +99,14 @@ class SubtreeBuilder {
 
     References at(size_t place) const { return input_.references.at(place); }
 
-    /// Gives away the waiting node nearest to the root, which is the largest as a rule.
+    /// Gives away the waiting node nearest to the root for which there is room: the largest, as a rule.
     void share() {
         for (Waiting* waiting : waiting_) {
             if (waiting->given == SubtreeSharing::kNotGiven && waiting->node.count >= kLeastToGive) {
                 waiting->given = input_.sharing->give(waiting->node, at(waiting->begin));
-                return;
+                if (waiting->given != SubtreeSharing::kNotGiven) {
+                    return;
+                }
             }
         }
     }

@@ -34,7 +34,8 @@ template <class DI>
 HWY_INLINE hn::Vec<DI> sort_keys_of(DI di, hn::Vec<DI> bits) {
     return hn::Xor(bits, hn::And(hn::ShiftRight<31>(bits), hn::Set(di, 0x7fffffff)));
 }
-inline float from_sort_key(int32_t key) { return std::bit_cast<float>(key ^ ((key >> 31) & 0x7fffffff)); }
+/// A zero has no sign, since planes are compared bit by bit in the end.
+inline float from_sort_key(int32_t key) { return std::bit_cast<float>(key ^ ((key >> 31) & 0x7fffffff)) + 0.0F; }
 
 /// Sorts the first `count` keys: by radix, if they are enough for that to pay.
 inline void sort_keys(LargeBuffer<int32_t>& keys, uint32_t count, LargeBuffer<int32_t>& scratch) {

@@ -118,7 +118,8 @@ class SubtreeOutput {
         const size_t blocks = triangles / kBlockSize;
         const size_t bytes =
             nodes * (sizeof(KdNode) + sizeof(Box3f)) + blocks * (kBlockSize * sizeof(uint32_t) + sizeof(Box3f));
-        LargeBuffer<std::byte> memory(bytes);
+        // Half of each array is used as a rule: huge pages would waste much of a small tree's memory.
+        LargeBuffer<std::byte> memory(bytes, bytes < 2 * LargeBuffer<std::byte>::kHugePage ? 0 : bytes);
         auto* new_nodes = reinterpret_cast<KdNode*>(memory.data());
         auto* new_boxes = reinterpret_cast<Box3f*>(new_nodes + nodes);
         auto* new_part_boxes = new_boxes + nodes;

@@ -31,7 +31,8 @@ void Subtrees::add_below(TopLevels& top) {
     gather_all(top);
 }
 
-/// Lays the references of each subtree side by side behind those of the top levels, whose places then become rooms.
+/// Lays the references of each subtree side by side behind those of the top levels, whose places then become rooms,
+/// or in memory of their own where there are too few places.
 void Subtrees::gather_all(TopLevels& top) {
     constexpr size_t kMargin = ReferenceBuffer::kSlack;
     const auto threads = static_cast<size_t>(threads_);
@@ -44,8 +45,9 @@ void Subtrees::gather_all(TopLevels& top) {
     size_t first_room = 0;
     size_t room = used / threads;
     references_ = memory.references();
-    if (used + count > memory.capacity()) {
-        room = subtree_room(waiting_.front()->root.count);
+    const uint32_t largest = waiting_.front()->root.count;
+    if (used + count > memory.capacity() || room < largest + largest / 8 + kMargin) {
+        room = subtree_room(largest);
         own_references_ = ReferenceBuffer(count + threads * room);
         references_ = own_references_.references();
         place = 0;
