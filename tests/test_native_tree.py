@@ -164,8 +164,8 @@ def test_qualities_keep_their_promises_of_cost(name: str) -> None:
     excess = {quality: report["sah_cost"] / reports["exact"]["sah_cost"] - 1 for quality, report in reports.items()}
     assert 0 < excess["balanced"] <= 0.05
     assert excess["balanced"] < excess["draft"] <= 0.12
-    # Greedy choices of the cheapest plane need not add up to the cheapest tree.
-    assert -0.01 <= excess["best"] <= 0.01
+    # Greedy choices of the cheapest plane need not add up to the cheapest tree, but come near it.
+    assert -0.02 <= excess["best"] <= 0.01
 
 
 def test_hit_is_the_point_that_u_and_v_name() -> None:
