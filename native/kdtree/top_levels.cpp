@@ -9,9 +9,10 @@ namespace espalier {
 namespace {
 
 /// Small enough to share out among the threads, large enough that a segment is still worth a vector loop a few levels
-/// down.
+/// down, of which large scenes have more.
 uint32_t choose_segment_size(uint32_t triangles, int threads) {
-    return std::clamp<uint32_t>(triangles / (16 * static_cast<uint32_t>(threads)), 1024, 8192);
+    const uint32_t most = std::max<uint32_t>(8192, triangles / 128);
+    return std::clamp<uint32_t>(triangles / (16 * static_cast<uint32_t>(threads)), 1024, most);
 }
 
 /// Segments keep a quarter of their size free, so that most right halves fit behind their left ones although straddlers
