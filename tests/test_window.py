@@ -54,9 +54,9 @@ def test_panel_and_overlay_in_a_window() -> None:
     background, *bars = places["boxes"]
     assert len(bars) >= 2  # serial, and at least one thread count
     assert places["labels"] == 1 + 2 * len(bars)
-    assert np.median(part("after", background)) < np.median(part("before", background)) - 0.05, (
-        "no dark ground for the bars"
-    )
+    # Judged below the bars: how much of the box they and the text cover depends on what the builds took.
+    ground = {**background, "height": min(bar["y"] for bar in bars) - background["y"] - 1.0}
+    assert np.median(part("after", ground) / part("before", ground)) < 0.75, "no dark ground for the bars"
     for bar in bars:
         inner = part("after", bar)[2:-2, 1:-1]
         assert np.abs(np.median(inner, axis=(0, 1)) - bar["color"][:3]).max() < 0.03
