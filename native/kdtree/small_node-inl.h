@@ -24,26 +24,26 @@ HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
 namespace hn = hwy::HWY_NAMESPACE;
 
-/// A set of references as a bit mask, in words that hold as many bits as a lane that counts references.
+/// A set of references as a bit mask.
 template <size_t kWords>
 struct Members {
-    uint32_t word[kWords];
+    uint64_t word[kWords];
 
     uint32_t count() const {
         uint32_t sum = 0;
-        for (const uint32_t bits : word) {
+        for (const uint64_t bits : word) {
             sum += static_cast<uint32_t>(std::popcount(bits));
         }
         return sum;
     }
 };
 
-/// Finishes a node of at most 32 * kWords references.
+/// Finishes a node of at most 64 * kWords references.
 template <size_t kWords>
 class SmallNode {
  public:
-    static constexpr uint32_t kCapacity = 32 * kWords;
-    static constexpr int kSteps = 64;
+    static constexpr uint32_t kCapacity = 64 * kWords;
+    static constexpr int kStepBits = 6;
 
     HWY_INLINE SmallNode(const References& references, const OpenNode& node, const BuildParameters& parameters,
                          SubtreeOutput& output)
@@ -56,24 +56,30 @@ class SmallNode {
             const auto a = static_cast<size_t>(axis);
             place_planes(axis, node.count, references.lower[a], references.upper[a], node.tight);
         }
-        store_boxes(references, node);
+        store_boxes(references, node.count);
+        if (parameters.arrange) {
+            store_middles(references, node);
+        }
         Members<kWords> all;
         for (uint32_t w = 0; w < kWords; ++w) {
-            const uint32_t left = node.count > 32 * w ? node.count - 32 * w : 0;
-            all.word[w] = left >= 32 ? ~0U : (1U << left) - 1;
+            const uint32_t left = node.count > 64 * w ? node.count - 64 * w : 0;
+            all.word[w] = left >= 64 ? ~uint64_t{0} : (uint64_t{1} << left) - 1;
         }
         cost_ = split(all, node);
     }
     float cost() const { return cost_; }  ///< per ray that meets the node's cell
 
  private:
-    /// Per axis, word and plane: the references that begin before the plane, and those that end behind it.
-    using PlaneMasks = uint32_t[3][kWords][kPlanes];
+    using DF = hn::CappedTag<float, 16>;
+
+    /// Per axis and plane the references that begin before the plane, or those that end behind it: half words, as wide
+    /// as a lane that counts references.
+    using PlaneMasks = uint32_t[3][2 * kWords][kPlanes];
 
     /// The planes of one axis and the masks of what begins before and ends behind each.
     HWY_INLINE void place_planes(int axis, uint32_t count, const float* lowers, const float* uppers,
                                  const Box3f& tight) {
-        const hn::CappedTag<float, 16> df;
+        const DF df;
         const hn::CappedTag<int8_t, 64> d8;
         const float lower = tight.lower[axis];
         const float upper = tight.upper[axis];
@@ -104,7 +110,7 @@ class SmallNode {
             }
         }
         // The last plane is the end of the tight box: all lie before it, even what lies in it.
-        for (size_t w = 0; w < kWords; ++w) {
+        for (size_t w = 0; w < 2 * kWords; ++w) {
             left[w][kSlices] = ~0U;
             right[w][kSlices] = 0;
         }
@@ -112,7 +118,7 @@ class SmallNode {
 
     template <class D>
     static HWY_INLINE void store_bits(D d, hn::Mask<D> mask, size_t first, int plane,
-                                      uint32_t (&masks)[kWords][kPlanes]) {
+                                      uint32_t (&masks)[2 * kWords][kPlanes]) {
         const uint64_t bits = mask_bits(d, mask);
         if constexpr (hn::MaxLanes(D()) == 16) {
             uint32_t& word = masks[first / 32][plane];
@@ -124,36 +130,49 @@ class SmallNode {
         }
     }
 
-    /// The boxes reference by reference, upper bounds negated: a union is two minima. And the middles of the boxes, in
-    /// steps along each side of the node.
-    HWY_INLINE void store_boxes(const References& references, const OpenNode& node) {
-        const hn::CappedTag<float, 16> d;
-        const hn::Rebind<int8_t, decltype(d)> d8;
-        const hn::RebindToSigned<decltype(d)> di;
-        const auto lanes = static_cast<uint32_t>(hn::Lanes(d));
-        for (uint32_t i = 0; i < node.count; i += lanes) {
+    /// The boxes reference by reference, upper bounds negated: a union is two minima.
+    HWY_INLINE void store_boxes(const References& references, uint32_t count) {
+        const DF d;
+        for (uint32_t i = 0; i < count; i += static_cast<uint32_t>(hn::Lanes(d))) {
             hn::StoreInterleaved4(hn::LoadU(d, references.lower[0] + i), hn::LoadU(d, references.lower[1] + i),
                                   hn::LoadU(d, references.lower[2] + i), hn::Zero(d), d, lowers_[i]);
             hn::StoreInterleaved4(hn::Neg(hn::LoadU(d, references.upper[0] + i)),
                                   hn::Neg(hn::LoadU(d, references.upper[1] + i)),
                                   hn::Neg(hn::LoadU(d, references.upper[2] + i)), hn::Zero(d), d, uppers_[i]);
         }
+    }
+
+    /// The middles of the boxes, in steps along each side of the node.
+    HWY_INLINE void store_middles(const References& references, const OpenNode& node) {
+        constexpr int kSteps = 1 << kStepBits;
+        const DF d;
+        const hn::Rebind<int8_t, DF> d_steps;
+        const hn::RebindToSigned<DF> di;
+        const hn::CappedTag<uint8_t, 64> d8;
         for (int axis = 0; axis < 3; ++axis) {
             const auto a = static_cast<size_t>(axis);
             const float low = node.tight.lower[axis];
             const float high = node.tight.upper[axis];
             const auto origin = hn::Set(d, low + low);
             const auto scale = hn::Set(d, Slices::can_be_cut(low, high) ? 0.5F * kSteps / (high - low) : 0.0F);
-            for (uint32_t i = 0; i < node.count; i += lanes) {
+            alignas(64) int8_t steps[kCapacity];
+            for (uint32_t i = 0; i < node.count; i += static_cast<uint32_t>(hn::Lanes(d))) {
                 const auto twice =
                     hn::Add(hn::LoadU(d, references.lower[a] + i), hn::LoadU(d, references.upper[a] + i));
                 const auto step = truncate(di, hn::Mul(hn::Sub(twice, origin), scale));
-                hn::StoreU(hn::DemoteTo(d8, hn::Min(step, hn::Set(di, kSteps - 1))), d8, middles_[a] + i);
+                hn::StoreU(hn::DemoteTo(d_steps, hn::Min(step, hn::Set(di, kSteps - 1))), d_steps, steps + i);
+            }
+            for (size_t i = 0; i < node.count; i += hn::Lanes(d8)) {
+                const auto step = hn::Load(d8, reinterpret_cast<const uint8_t*>(steps) + i);
+                for (int j = 0; j < kStepBits; ++j) {
+                    const auto bit = hn::Set(d8, static_cast<uint8_t>(1 << (kStepBits - 1 - j)));
+                    const uint64_t bits = mask_bits(d8, hn::TestBit(step, bit));
+                    std::memcpy(reinterpret_cast<std::byte*>(middles_[axis][j].word) + i / 8, &bits,
+                                hn::MaxLanes(d8) / 8);
+                }
             }
         }
     }
-
-    using DF = hn::CappedTag<float, 16>;
 
     /// The cheapest plane inside the cell.
     HWY_INLINE CheapestPlane<DF> cheapest_plane(const Members<kWords>& members, const SplitCosts<DF>& costs,
@@ -168,8 +187,8 @@ class SmallNode {
             for (int j = 0; j < kPlanes; j += static_cast<int>(hn::Lanes(df))) {
                 auto left = hn::Zero(du);
                 auto right = hn::Zero(du);
-                for (size_t w = 0; w < kWords; ++w) {
-                    const auto member_bits = hn::Set(du, members.word[w]);
+                for (size_t w = 0; w < 2 * kWords; ++w) {
+                    const auto member_bits = hn::Set(du, static_cast<uint32_t>(members.word[w / 2] >> (32 * (w % 2))));
                     const auto of = [&](const PlaneMasks& masks) {
                         return hn::PopulationCount(hn::And(hn::Load(du, masks[axis][w] + j), member_bits));
                     };
@@ -191,7 +210,8 @@ class SmallNode {
     static Members<kWords> on_side(const Members<kWords>& members, const PlaneMasks& masks, int axis, int plane) {
         Members<kWords> side;
         for (size_t w = 0; w < kWords; ++w) {
-            side.word[w] = members.word[w] & masks[axis][w][plane];
+            const uint64_t high = masks[axis][2 * w + 1][plane];
+            side.word[w] = members.word[w] & (high << 32 | masks[axis][2 * w][plane]);
         }
         return side;
     }
@@ -325,64 +345,45 @@ class SmallNode {
     /// The members' places, in order; what follows them does not matter. Eight are written at a time whatever the
     /// number of bits, since how often a loop runs could not be foreseen (Langdale and Lemire 2019, section 3.1.1).
     static HWY_INLINE void list(const Members<kWords>& members, uint8_t* places) {
-        for (size_t w = 0; w < kWords; w += 2) {
-            uint64_t rest = uint64_t{members.word[w + 1]} << 32 | members.word[w];
+        for (size_t w = 0; w < kWords; ++w) {
+            uint64_t rest = members.word[w];
             const int bits = std::popcount(rest);
             int i = 0;
             do {
                 for (const int end = i + 8; i < end; ++i, rest &= rest - 1) {
-                    places[i] = static_cast<uint8_t>(32 * w + static_cast<size_t>(std::countr_zero(rest)));
+                    places[i] = static_cast<uint8_t>(64 * w + static_cast<size_t>(std::countr_zero(rest)));
                 }
             } while (i < bits);
             places += bits;
         }
     }
 
-    /// So many of the references, those whose middles come first along an axis.
+    /// So many of the references, those whose middles come first along an axis; where middles are in one step, those
+    /// that come first in the mesh.
     HWY_INLINE Members<kWords> lowest(const Members<kWords>& members, size_t axis, uint32_t wanted) const {
-        int limit = 0;
-        for (int step = kSteps / 8; step != 0; step /= 8) {
-            int few_enough = 0;
-            for (int k = 1; k < 8; ++k) {
-                uint32_t below = 0;
-                for_each_below(members, axis, limit + k * step,
-                               [&](size_t, uint64_t bits) { below += static_cast<uint32_t>(std::popcount(bits)); });
-                few_enough += below <= wanted ? 1 : 0;
+        Members<kWords> chosen{};
+        Members<kWords> undecided = members;
+        // Bit by bit, the highest first: either all whose bit is zero are among those wanted, or all others are not.
+        for (const Members<kWords>& bit : middles_[axis]) {
+            Members<kWords> zeros;
+            for (size_t w = 0; w < kWords; ++w) {
+                zeros.word[w] = undecided.word[w] & ~bit.word[w];
             }
-            limit += few_enough * step;
+            const uint32_t count = zeros.count();
+            const uint64_t all = count <= wanted ? ~uint64_t{0} : 0;  // no branch: it could not be foreseen
+            wanted -= count & static_cast<uint32_t>(all);
+            for (size_t w = 0; w < kWords; ++w) {
+                chosen.word[w] |= zeros.word[w] & all;
+                undecided.word[w] &= ~(bit.word[w] ^ all);
+            }
         }
-        // Of those at the limit, the first.
-        Members<kWords> chosen;
-        const auto store = [](Members<kWords>& to) {
-            return [&to](size_t first, uint64_t bits) {
-                constexpr size_t kBytes = hn::MaxLanes(hn::CappedTag<int8_t, 64>()) / 8;
-                std::memcpy(reinterpret_cast<std::byte*>(to.word) + first / 8, &bits, kBytes);
-            };
-        };
-        for_each_below(members, axis, limit, store(chosen));
-        Members<kWords> next;
-        for_each_below(members, axis, limit + 1, store(next));
-        uint32_t missing = wanted - chosen.count();
-        for (size_t w = 0; missing != 0; ++w) {
-            for (uint32_t rest = next.word[w] & ~chosen.word[w]; rest != 0 && missing != 0; --missing) {
+        for (size_t w = 0; wanted != 0; ++w) {
+            for (uint64_t rest = undecided.word[w]; rest != 0 && wanted != 0; --wanted) {
                 chosen.word[w] |= rest & -rest;
                 rest &= rest - 1;
             }
         }
         return chosen;
-    }
-
-    /// Calls f(first, bits) for the members among as many references as a vector has bytes, of those whose middles lie
-    /// below a limit.
-    template <class F>
-    HWY_INLINE void for_each_below(const Members<kWords>& members, size_t axis, int limit, const F& f) const {
-        const hn::CappedTag<int8_t, 64> d;
-        for (size_t i = 0; i < kCapacity; i += hn::Lanes(d)) {
-            const auto is_below = hn::Lt(hn::Load(d, middles_[axis] + i), hn::Set(d, static_cast<int8_t>(limit)));
-            uint64_t own = 0;
-            std::memcpy(&own, reinterpret_cast<const std::byte*>(members.word) + i / 8, hn::MaxLanes(d) / 8);
-            f(i, mask_bits(d, is_below) & own);
-        }
     }
 
     const BuildParameters& parameters_;
@@ -397,14 +398,14 @@ class SmallNode {
     alignas(64) PlaneMasks right_;
     alignas(64) float lowers_[kCapacity][4];
     alignas(64) float uppers_[kCapacity][4];
-    alignas(64) int8_t middles_[3][kCapacity];
+    Members<kWords> middles_[3][kStepBits];  ///< those that have each bit in their step, the highest first
 };
 
 /// Finishes a node of at most parameters.small_node references; returns the cost of what was built.
 inline float finish_small_node(const References& references, const OpenNode& node, const BuildParameters& parameters,
                                SubtreeOutput& output) {
-    return parameters.small_node <= SmallNode<2>::kCapacity ? SmallNode<2>(references, node, parameters, output).cost()
-                                                            : SmallNode<8>(references, node, parameters, output).cost();
+    return parameters.small_node <= SmallNode<1>::kCapacity ? SmallNode<1>(references, node, parameters, output).cost()
+                                                            : SmallNode<4>(references, node, parameters, output).cost();
 }
 
 }  // namespace espalier::HWY_NAMESPACE
