@@ -13,8 +13,8 @@
 
 #include <bit>
 
-#include "kdtree/binning-inl.h"
 #include "kdtree/build_kernels.h"
+#include "kdtree/compress-inl.h"
 #include "kdtree/corners-inl.h"
 
 HWY_BEFORE_NAMESPACE();

@@ -19,6 +19,7 @@
 
 #include "kdtree/binning-inl.h"
 #include "kdtree/build_kernels.h"
+#include "kdtree/compress-inl.h"
 
 HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
@@ -94,8 +95,12 @@ class SmallNode {
             std::memset(right, 0, sizeof right);
             return;
         }
-        Quantised<kCapacity> q;
-        quantise<true>(df, lowers, uppers, slices, kSlices, count, q);
+        alignas(64) int8_t begins[kCapacity];
+        alignas(64) int8_t ends[kCapacity];
+        quantise<true>(df, lowers, uppers, slices, kSlices, count, [&](uint32_t i, const auto begin, const auto end) {
+            hn::Store(begin, d8, begins + i);
+            hn::Store(end, d8, ends + i);
+        });
         for (int j = 0; j < kPlanes; j += static_cast<int>(hn::Lanes(df))) {
             hn::Store(slice_positions(df, lower, upper, j), df, positions + j);
         }
@@ -103,8 +108,8 @@ class SmallNode {
             const auto plane = hn::Set(d8, static_cast<int8_t>(j));
             const auto before = hn::Set(d8, static_cast<int8_t>(j - 1));
             for (size_t i = 0; i < kCapacity; i += hn::Lanes(d8)) {
-                const auto begin = hn::Load(d8, q.begin + i);
-                const auto end = hn::Load(d8, q.end + i);
+                const auto begin = hn::Load(d8, begins + i);
+                const auto end = hn::Load(d8, ends + i);
                 store_bits(d8, hn::Lt(begin, plane), i, j, left);
                 store_bits(d8, hn::Gt(end, before), i, j, right);
             }

@@ -13,9 +13,9 @@
 // Highway's own header has to follow foreach_target.h.
 #include <hwy/highway.h>
 
-#include "kdtree/binning-inl.h"
 #include "kdtree/bounds-inl.h"
 #include "kdtree/partition-inl.h"
+#include "kdtree/slices-inl.h"
 
 #ifndef ESPALIER_TEST_BUILD_BOUNDS_TYPES
 #define ESPALIER_TEST_BUILD_BOUNDS_TYPES
@@ -73,12 +73,15 @@ inline SlicesResult slices_of(float lower, float upper, float low, float high) {
     for (int j = 0; j < 16; j += static_cast<int>(hn::Lanes(d))) {
         hn::StoreU(slice_positions(d, lower, upper, j), d, result.position + j);
     }
-    Quantised<64> q;
     std::vector<float> lows(64, low);
     std::vector<float> highs(64, high);
-    quantise<true>(d, lows.data(), highs.data(), Slices(lower, upper), kSlices, 1, q);
-    result.begin = q.begin[0];
-    result.end = q.end[0];
+    quantise<true>(d, lows.data(), highs.data(), Slices(lower, upper), kSlices, 1,
+                   [&](uint32_t first, const auto begin, const auto end) {
+                       if (first == 0) {
+                           result.begin = hn::GetLane(begin);
+                           result.end = hn::GetLane(end);
+                       }
+                   });
     result.reach = reach_beyond_slices(lower, upper);
     return result;
 }
