@@ -78,7 +78,7 @@ class Packet {
                 const uint32_t first = WideNode::first_block(child);
                 const uint32_t end = first + WideNode::blocks(child);
                 for (uint32_t block = first; block < end; block += kBlocksPerStep) {
-                    visit_blocks(block, block + 1 == end);
+                    visit_blocks(block, block + 1 < end ? 1 : 0);
                 }
                 if (kAnyHit && reach_ < 0) {
                     return;
@@ -398,12 +398,10 @@ class Packet {
     }
 
     /// Tests the triangles of a block, or of two, that are not wholly beside the packet.
-    HWY_INLINE void visit_blocks(uint32_t index, bool is_single) {
+    HWY_INLINE void visit_blocks(uint32_t index, uint32_t second) {
         View view;
-        uint32_t reached = view.look(focus_, BlockLoader(blocks_ + index, is_single), entry_, reach_);
-        if (is_single) {
-            reached &= (1U << kBlockSize) - 1;
-        }
+        uint32_t reached = view.look(focus_, BlockLoader(blocks_ + index, second), entry_, reach_);
+        reached &= (1U << (kBlockSize * (1 + second))) - 1;
         // First which of them some ray meets, without a branch for each: those are hard to foresee.
         uint32_t met[View::kSize];
         size_t count = 0;

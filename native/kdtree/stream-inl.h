@@ -154,7 +154,7 @@ class Stream {
                 const uint32_t block = WideNode::first_block(leaf);
                 Verdict verdict;
                 const uint32_t possible =
-                    test_blocks<kExact>(ray, blocks_ + block, further == 0, batch_.least_inside(), verdict);
+                    test_blocks<kExact>(ray, blocks_ + block, at_most_one(further), batch_.least_inside(), verdict);
                 if (possible != 0 && take(ray, verdict, possible, block)) {
                     if constexpr (kAnyHit) {
                         end_list_[lists.at_end++] = &ray;
@@ -163,12 +163,13 @@ class Stream {
                         ray.prune();
                     }
                 }
-                // The rest of the leaf is some blocks further, and as many less.
-                const bool is_last = further < kBlocksPerStep;
+                // The rest of the leaf is some blocks further, and as many less. Where there is none, what lies on top
+                // is next, again chosen without a branch: how long leaves are cannot be foreseen.
+                const uint32_t is_last = (further - kBlocksPerStep) >> 31;
                 const uint32_t rest = leaf + (WideNode::kMaxLeafBlocks - 1) * kBlocksPerStep;
                 const uint32_t top = ray.top[-1];
-                ray.top -= is_last ? 1 : 0;
-                go_on(ray, is_last ? top : rest, lists);
+                ray.top -= is_last;
+                go_on(ray, rest ^ ((rest ^ top) & (0U - is_last)), lists);
             }
             const uint32_t ended = std::exchange(lists.at_end, 0);
             for (uint32_t i = 0; i < ended; ++i) {
@@ -188,6 +189,11 @@ class Stream {
         uint32_t at_leaf = 0;
         uint32_t at_end = 0;
     };
+
+    /// 0 for 0, 1 for all other numbers of blocks.
+    static HWY_INLINE uint32_t at_most_one(uint32_t blocks) {
+        return (blocks + WideNode::kMaxLeafBlocks - 1) / WideNode::kMaxLeafBlocks;
+    }
 
     /// Puts the next ray, if there is one, in place of one that has ended.
     HWY_INLINE void begin(StreamRay& ray, Lists& lists) {

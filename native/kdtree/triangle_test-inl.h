@@ -36,8 +36,9 @@ struct Verdict {
 /// Reads blocks lane by lane, those of a second block behind the first's; a single block stands for both.
 class BlockLoader {
  public:
-    HWY_INLINE BlockLoader(const TriangleBlock* block, bool is_single)
-        : first_(block->vertex[0][0]), second_(block[is_single ? 0 : 1].vertex[0][0]) {}
+    /// second: 1, or 0 for a single block. Not a choice, which compilers would make with a branch.
+    HWY_INLINE BlockLoader(const TriangleBlock* block, uint32_t second)
+        : first_(block->vertex[0][0]), second_(block[second].vertex[0][0]) {}
 
     HWY_INLINE auto operator()(size_t from) const {
         const hn::CappedTag<float, kBlocksPerStep * kBlockSize> d;
@@ -55,10 +56,10 @@ class BlockLoader {
 };
 
 /// That of the larger of the blocks that a step tests.
-HWY_INLINE uint32_t size_class(const TriangleBlock* block, bool is_single) {
+HWY_INLINE uint32_t size_class(const TriangleBlock* block, uint32_t second) {
     uint32_t triangle = block->triangle[0];
     if constexpr (kBlocksPerStep == 2) {
-        triangle = std::min(triangle, block[is_single ? 0 : 1].triangle[0]);
+        triangle = std::min(triangle, block[second].triangle[0]);
     }
     return triangle / kMaxTriangles;
 }
@@ -167,12 +168,12 @@ HWY_INLINE DepthRange<V> depth_range(const V (&side)[3], V bound, V mz, V z0, V 
 /// operations only leave roundings out. Underflow adds less than kTiny: a product's is below 2^-149, and a coordinate's
 /// counts by at most 2^-149 s, which u s^2 outweighs from s = 2^-125 on.
 template <bool kExact>
-HWY_INLINE uint32_t test_blocks(const TracedRay& ray, const TriangleBlock* block, bool is_single,
+HWY_INLINE uint32_t test_blocks(const TracedRay& ray, const TriangleBlock* block, uint32_t second,
                                 const float* least_inside_of_class, Verdict& verdict) {
     const hn::CappedTag<float, kBlocksPerStep * kBlockSize> d;
     constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<float, kBlocksPerStep * kBlockSize>());
     using V = hn::Vec<decltype(d)>;
-    const BlockLoader load(block, is_single);
+    const BlockLoader load(block, second);
     const ShearedRay<V> sheared{ray.x,
                                 ray.y,
                                 ray.z,
@@ -182,7 +183,7 @@ HWY_INLINE uint32_t test_blocks(const TracedRay& ray, const TriangleBlock* block
                                 hn::Set(d, ray.sx),
                                 hn::Set(d, ray.sy),
                                 hn::Set(d, ray.slant)};
-    const V least_inside = kExact ? hn::Set(d, least_inside_of_class[size_class(block, is_single)]) : hn::Zero(d);
+    const V least_inside = kExact ? hn::Set(d, least_inside_of_class[size_class(block, second)]) : hn::Zero(d);
     uint32_t possible = 0;
     for (size_t first = 0; first < kBlockSize; first += kLanes) {
         const Sheared<V> seen(sheared,
@@ -216,7 +217,7 @@ HWY_INLINE uint32_t test_blocks(const TracedRay& ray, const TriangleBlock* block
         possible |= mask_bits(d, counts) << first;
         verdict.certain |= mask_bits(d, certain) << first;
     }
-    return is_single ? possible & ((1U << kBlockSize) - 1) : possible;
+    return second == 0 ? possible & ((1U << kBlockSize) - 1) : possible;
 }
 
 }  // namespace espalier::HWY_NAMESPACE

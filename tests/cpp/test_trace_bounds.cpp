@@ -135,7 +135,8 @@ inline FilterResult filter(const Ray& ray, const Vec3f (&corner)[3], const Box3f
     Verdict verdict{};
     constexpr bool kTwo = kBlocksPerStep == 2;
     constexpr uint32_t kLane = kTwo ? kBlockSize : 0;
-    const uint32_t possible = test_blocks<true>(traced, blocks + (kTwo ? 0 : 1), !kTwo, batch.least_inside(), verdict);
+    const uint32_t possible =
+        test_blocks<true>(traced, blocks + (kTwo ? 0 : 1), kTwo ? 1 : 0, batch.least_inside(), verdict);
     return {{hn::GetLane(seen.side[0]), hn::GetLane(seen.side[1]), hn::GetLane(seen.side[2])},
             hn::GetLane(bound),
             batch.least_inside()[size_class],
@@ -171,7 +172,7 @@ inline ViewResult look(const Ray& ray, const Vec3f (&corner)[3], const SeenFromF
     focus.sign = std::copysign(1.0F, along) * (seen.deviation > 0 ? -1.0F : 1.0F);
     focus.set_errors(seen.deviation);
     FocusView<true> view;
-    const uint32_t reached = view.look(focus, BlockLoader(&block, true), -seen.deviation, kInfinity);
+    const uint32_t reached = view.look(focus, BlockLoader(&block, 0), -seen.deviation, kInfinity);
     const hn::CappedTag<float, 4> d;
     hn::Vec<decltype(d)> side[3];
     view.sides(d, 0, hn::Set(d, off[0]), hn::Set(d, off[1]), side);
