@@ -34,7 +34,7 @@ BuildParameters parameters_of(Quality quality) {
     SahConstants sah;
     switch (quality) {
         case Quality::kDraft:
-            sah.block = sah.traversal / 2;  // two blocks are a leaf without a search
+            sah.block = sah.traversal / 3;  // three blocks are a leaf without a search
             return {sah, Search::kFinerSlices, false, false, 256, 256};
         case Quality::kBalanced:
             return {sah, Search::kFinerSlices, true, true, 256, 256};
