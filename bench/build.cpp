@@ -50,7 +50,10 @@ Json quality_of(const Tree& tree) {
     const BuildReport& report = tree.report;
     char checksum[17];
     std::snprintf(checksum, sizeof checksum, "%016llx", static_cast<unsigned long long>(report.checksum));
-    return {{"sah_block", report.sah_cost},
+    const SahConstants model;
+    return {{"step", model.traversal},
+            {"block", model.block},
+            {"sah_block", report.sah_cost},
             {"sah_classic", (kStep * sum.steps + kTriangle * sum.triangles) / area},
             {"nodes", report.nodes},
             {"wide_nodes", report.wide_nodes},

@@ -283,9 +283,10 @@ def markdown(report: dict[str, Any]) -> str:
             table(head, preview_rows(meshes)),
         ]
     for meshes in per_simd(report, "quality").values():
+        model = next(iter(meshes[0][1]["quality"].values()))
         head = (
-            "mesh | mode | SAH cost, step 15 and block 10 | over exact | SAH cost, step 15 and triangle 20 | "
-            "nodes | wide nodes | references per triangle | checksum"
+            f"mesh | mode | SAH cost, step {model['step']:g} and block {model['block']:g} | over exact | "
+            "SAH cost, step 15 and triangle 20 | nodes | wide nodes | references per triangle | checksum"
         )
         parts += ["## Quality", table(head, quality_rows(meshes))]
     for meshes in per_simd(report, "memory").values():

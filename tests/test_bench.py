@@ -139,6 +139,8 @@ def test_phases_are_medians_per_mode() -> None:
 
 def quality(sah: float) -> dict[str, Any]:
     return {
+        "step": 15.0,
+        "block": 8.0,
         "sah_block": sah,
         "sah_classic": 900.0,
         "nodes": 7,
@@ -150,7 +152,9 @@ def quality(sah: float) -> dict[str, Any]:
 
 def test_quality_is_stated_over_exact_where_that_was_built() -> None:
     both = {"draft": quality(550), "exact": quality(500)}
-    assert cells(markdown(report_of(quality=both)), "bunny", "draft")[3] == "+10.0 %"
+    text = markdown(report_of(quality=both))
+    assert "| SAH cost, step 15 and block 8 | over exact |" in text
+    assert cells(text, "bunny", "draft")[3] == "+10.0 %"
     assert cells(markdown(report_of(quality={"draft": quality(550)})), "bunny", "draft")[3] == ""
 
 
