@@ -20,6 +20,7 @@
 #include "kdtree/binning-inl.h"
 #include "kdtree/build_kernels.h"
 #include "kdtree/compress-inl.h"
+#include "kdtree/slice_masks-inl.h"
 
 HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
@@ -81,7 +82,6 @@ class SmallNode {
     HWY_INLINE void place_planes(int axis, uint32_t count, const float* lowers, const float* uppers,
                                  const Box3f& tight) {
         const DF df;
-        const hn::CappedTag<int8_t, 64> d8;
         const float lower = tight.lower[axis];
         const float upper = tight.upper[axis];
         const Slices slices(lower, upper);
@@ -95,44 +95,10 @@ class SmallNode {
             std::memset(right, 0, sizeof right);
             return;
         }
-        alignas(64) int8_t begins[kCapacity];
-        alignas(64) int8_t ends[kCapacity];
-        quantise<true>(df, lowers, uppers, slices, kSlices, count, [&](uint32_t i, const auto begin, const auto end) {
-            hn::Store(begin, d8, begins + i);
-            hn::Store(end, d8, ends + i);
-        });
         for (int j = 0; j < kPlanes; j += static_cast<int>(hn::Lanes(df))) {
             hn::Store(slice_positions(df, lower, upper, j), df, positions + j);
         }
-        for (int j = 0; j < kSlices; ++j) {
-            const auto plane = hn::Set(d8, static_cast<int8_t>(j));
-            const auto before = hn::Set(d8, static_cast<int8_t>(j - 1));
-            for (size_t i = 0; i < kCapacity; i += hn::Lanes(d8)) {
-                const auto begin = hn::Load(d8, begins + i);
-                const auto end = hn::Load(d8, ends + i);
-                store_bits(d8, hn::Lt(begin, plane), i, j, left);
-                store_bits(d8, hn::Gt(end, before), i, j, right);
-            }
-        }
-        // The last plane is the end of the tight box: all lie before it, even what lies in it.
-        for (size_t w = 0; w < 2 * kWords; ++w) {
-            left[w][kSlices] = ~0U;
-            right[w][kSlices] = 0;
-        }
-    }
-
-    template <class D>
-    static HWY_INLINE void store_bits(D d, hn::Mask<D> mask, size_t first, int plane,
-                                      uint32_t (&masks)[2 * kWords][kPlanes]) {
-        const uint64_t bits = mask_bits(d, mask);
-        if constexpr (hn::MaxLanes(D()) == 16) {
-            uint32_t& word = masks[first / 32][plane];
-            word = first % 32 == 0 ? static_cast<uint32_t>(bits) : word | static_cast<uint32_t>(bits << 16);
-        } else {
-            for (size_t k = 0; k < hn::MaxLanes(D()) / 32; ++k) {
-                masks[first / 32 + k][plane] = static_cast<uint32_t>(bits >> (32 * k));
-            }
-        }
+        mask_slices(lowers, uppers, slices, count, left, right);
     }
 
     /// The boxes reference by reference, upper bounds negated: a union is two minima.
