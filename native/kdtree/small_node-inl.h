@@ -284,7 +284,7 @@ class SmallNode {
         if (blocks <= whole) {
             auto lower = hn::Inf(d);
             auto negated_upper = hn::Inf(d);
-            uint8_t places[kCapacity + 8];
+            uint8_t places[kCapacity + 64];
             list(members, places);
             for (uint32_t i = 0; i < count; ++i) {
                 const size_t place = places[i];
@@ -313,9 +313,19 @@ class SmallNode {
         return {hn::Min(first.lower, second.lower), hn::Min(first.negated_upper, second.negated_upper)};
     }
 
-    /// The members' places, in order; what follows them does not matter. Eight are written at a time whatever the
-    /// number of bits, since how often a loop runs could not be foreseen (Langdale and Lemire 2019, section 3.1.1).
+    /// The members' places, in order; what follows them does not matter.
     static HWY_INLINE void list(const Members<kWords>& members, uint8_t* places) {
+#if HWY_TARGET == HWY_AVX3_DL
+        const hn::Full512<uint8_t> d;
+        auto place = hn::Iota(d, 0);
+        for (const uint64_t bits : members.word) {
+            _mm512_storeu_si512(places, _mm512_maskz_compress_epi8(bits, place.raw));
+            places += std::popcount(bits);
+            place = hn::Add(place, hn::Set(d, 64));
+        }
+#else
+        // Eight are written at a time whatever the number of bits, since how often a loop runs could not be foreseen
+        // (Langdale and Lemire 2019, section 3.1.1).
         for (size_t w = 0; w < kWords; ++w) {
             uint64_t rest = members.word[w];
             const int bits = std::popcount(rest);
@@ -327,6 +337,7 @@ class SmallNode {
             } while (i < bits);
             places += bits;
         }
+#endif
     }
 
     /// So many of the references, those whose middles come first along an axis; where middles are in one step, those
