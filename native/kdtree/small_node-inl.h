@@ -31,6 +31,7 @@ template <size_t kWords>
 struct Members {
     uint64_t word[kWords];
 
+    uint32_t half(size_t i) const { return static_cast<uint32_t>(word[i / 2] >> (32 * (i % 2))); }
     uint32_t count() const {
         uint32_t sum = 0;
         for (const uint64_t bits : word) {
@@ -154,12 +155,22 @@ class SmallNode {
         const auto round_up = hn::Set(du, kBlockSize - 1);
         const auto too_many = hn::Set(di, static_cast<int32_t>(std::min<uint64_t>(affordable, 2 * kCapacity) + 1));
         CheapestPlane cheapest(df);
+        // Where the planes of an axis are one vector, half words without members cost less than a branch on their
+        // number.
+        constexpr bool kSkipsEmpty = hn::MaxLanes(DF()) < kPlanes;
+        size_t half[2 * kWords];
+        size_t halves = 0;
+        for (size_t w = 0; w < 2 * kWords; ++w) {
+            half[halves] = w;
+            halves += !kSkipsEmpty || members.half(w) != 0 ? 1 : 0;
+        }
         for (int axis = 0; axis < 3; ++axis) {
             for (int j = 0; j < kPlanes; j += static_cast<int>(hn::Lanes(df))) {
                 auto left = hn::Zero(du);
                 auto right = hn::Zero(du);
-                for (size_t w = 0; w < 2 * kWords; ++w) {
-                    const auto member_bits = hn::Set(du, static_cast<uint32_t>(members.word[w / 2] >> (32 * (w % 2))));
+                for (size_t k = 0; k < halves; ++k) {
+                    const size_t w = half[k];
+                    const auto member_bits = hn::Set(du, members.half(w));
                     const auto of = [&](const PlaneMasks& masks) {
                         return hn::PopulationCount(hn::And(hn::Load(du, masks[axis][w] + j), member_bits));
                     };
