@@ -104,20 +104,30 @@ inline void count_slices(int axis, const float* lower, const float* upper, uint3
     ends.add_to(counts.ends_before[axis]);
 }
 #else
-/// Bytes of [values, values + count) below first_bound, first_bound + 1, ...; count is a multiple of 64.
+/// Vectors after which the counts of a byte lane may be full.
+constexpr uint32_t kMostVectors = 255;
+
+/// Bytes of [values, values + count) below first_bound, first_bound + 1, ...; count is a multiple of 64, and of at most
+/// kMostVectors. A comparison is -1 in each lane where it holds.
 template <int kPlanes>
 HWY_INLINE void count_below(const int8_t* values, uint32_t count, int first_bound, uint32_t* totals) {
     const hn::ScalableTag<int8_t> d;
-    uint32_t below[kPlanes] = {};
+    const hn::RebindToUnsigned<decltype(d)> du;
+    const hn::Repartition<uint64_t, decltype(d)> d64;
+    hn::Vec<decltype(d)> below[kPlanes];
+    for (auto& counts : below) {
+        counts = hn::Zero(d);
+    }
     for (uint32_t i = 0; i < count; i += static_cast<uint32_t>(hn::Lanes(d))) {
         const auto v = hn::Load(d, values + i);
         for (int k = 0; k < kPlanes; ++k) {
-            below[k] +=
-                static_cast<uint32_t>(hn::CountTrue(d, hn::Lt(v, hn::Set(d, static_cast<int8_t>(first_bound + k)))));
+            const auto is_below = hn::Lt(v, hn::Set(d, static_cast<int8_t>(first_bound + k)));
+            below[k] = hn::Sub(below[k], hn::VecFromMask(d, is_below));
         }
     }
     for (int k = 0; k < kPlanes; ++k) {
-        totals[first_bound + k] += below[k];
+        const auto sum = hn::SumOfLanes(d64, hn::SumsOf8(hn::BitCast(du, below[k])));
+        totals[first_bound + k] += static_cast<uint32_t>(hn::GetLane(sum));
     }
 }
 
@@ -125,14 +135,14 @@ inline void count_slices(int axis, const float* lower, const float* upper, uint3
                          BinCounts& counts) {
     const hn::ScalableTag<float> df;
     const hn::Repartition<int8_t, decltype(df)> d8;
-    constexpr uint32_t kChunk = 1024;
+    constexpr uint32_t kChunk = kMostVectors * hn::MaxLanes(hn::ScalableTag<int8_t>()) / 64 * 64;
     constexpr int kGroup = (kSlices - 1) / 2;  // planes whose counters stay in registers
     static_assert(kSlices % 2 == 1);
+    alignas(64) int8_t begins[kChunk];
+    alignas(64) int8_t ends[kChunk];
     for (uint32_t first = 0; first < count; first += kChunk) {
         const uint32_t size = std::min(kChunk, count - first);
         const uint32_t padded = (size + 63) / 64 * 64;
-        alignas(64) int8_t begins[kChunk];
-        alignas(64) int8_t ends[kChunk];
         quantise<false>(df, lower + first, upper + first, slices, kSlices - 1, size,
                         [&](uint32_t i, const auto begin, const auto end) {
                             hn::Store(begin, d8, begins + i);
