@@ -69,17 +69,19 @@ class ChildOrder {
                 node.upper[axis][i] = box.upper[axis];
             }
         }
+        // Unused slots come first, that is farthest: no ray meets them, but each slot has to appear once.
+        const int unused = WideNode::kWidth - count;
+        uint32_t farthest = 0;
+        for (int i = 0; i < unused; ++i) {
+            farthest |= static_cast<uint32_t>(count + i) << (3 * i);
+        }
         for (size_t octant = 0; octant < 8; ++octant) {
-            // Unused slots come first, that is farthest: no ray meets them, but each slot has to appear once.
-            uint32_t word = 0;
-            int place = 0;
-            for (int slot = count; slot < WideNode::kWidth; ++slot) {
-                word |= static_cast<uint32_t>(slot) << (3 * place++);
-            }
-            for (int rank = 0; rank < count; ++rank) {
-                word |= (order_[octant] >> (4 * rank) & 7U) << (3 * place++);
-            }
-            node.order[octant] = word;
+            // From 4 bits each to 3: in pairs, pairs of these, and both of those.
+            uint32_t slots = order_[octant];
+            slots = (slots & 0x07070707U) | (slots & 0x70707070U) >> 1;
+            slots = (slots & 0x003f003fU) | (slots & 0x3f003f00U) >> 2;
+            slots = (slots & 0x00000fffU) | (slots & 0x0fff0000U) >> 4;
+            node.order[octant] = slots << (3 * unused) | farthest;
         }
     }
 
