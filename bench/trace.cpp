@@ -155,7 +155,12 @@ constexpr size_t kTilePixels = size_t{kTile} * kTile;
 class OurBatch {
  public:
     explicit OurBatch(const Tree& tree) : tree_(tree) {}
-    void set(size_t i, const Ray& ray) { rays_[i] = ray; }
+    void set(size_t i, const Vec3f& origin, const Vec3f& direction, float t_max) {
+        rays_[i].origin = origin;
+        rays_[i].t_min = 0;
+        rays_[i].direction = direction;
+        rays_[i].t_max = t_max;
+    }
     void find_closest(size_t count) { intersect(tree_, std::span(rays_).first(count), std::span(hits_).first(count)); }
     void find_any(size_t count) { occluded(tree_, std::span(rays_).first(count), std::span(blocked_).first(count)); }
     uint32_t face(size_t i) const { return static_cast<uint32_t>(hits_[i].triangle); }
@@ -174,7 +179,9 @@ template <int kWidth>
 class EmbreeBatch {
  public:
     explicit EmbreeBatch(RTCScene scene) : scene_(scene) {}
-    void set(size_t i, const Ray& ray) { put(packets_[i / kWidth].ray, i % kWidth, ray); }
+    void set(size_t i, const Vec3f& origin, const Vec3f& direction, float t_max) {
+        put(packets_[i / kWidth].ray, i % kWidth, {origin, 0, direction, t_max});
+    }
     void find_closest(size_t count) {
         each_packet(count, [&](RTCIntersectContext& context, const int* valid, auto& packet) {
             std::fill_n(packet.hit.primID, kWidth, kNoFace);
@@ -209,36 +216,43 @@ class EmbreeBatch {
     std::array<typename Packet<kWidth>::RayHits, kTilePixels / kWidth> packets_;
 };
 
+struct Pixel {
+    int x, y;
+
+    size_t place() const { return static_cast<size_t>(y) * kPicture + static_cast<size_t>(x); }
+};
+
+/// The pixels of a tile come square by square.
+Pixel pixel_of(int x0, int y0, size_t i) {
+    constexpr int kAcross = kTile / kSquare;
+    const int square = static_cast<int>(i) / (kSquare * kSquare);
+    const int pixel = static_cast<int>(i) % (kSquare * kSquare);
+    return {x0 + square % kAcross * kSquare + pixel % kSquare, y0 + square / kAcross * kSquare + pixel / kSquare};
+}
+
 /// One tile: closest hits, a shadow ray from each of them, and light by Lambert's law.
 template <class Batch>
 void draw_tile(const Mesh& mesh, const Pinhole& camera, float offset, int x0, int y0, Batch& eye, Batch& light,
                std::vector<float>& picture) {
-    std::array<Ray, kTilePixels> rays;
-    std::array<size_t, kTilePixels> place;
     std::array<float, kTilePixels> shade;
     std::array<size_t, kTilePixels> lit;
     for (size_t i = 0; i < kTilePixels; ++i) {
-        constexpr int kAcross = kTile / kSquare;
-        const int square = static_cast<int>(i) / (kSquare * kSquare);
-        const int pixel = static_cast<int>(i) % (kSquare * kSquare);
-        const int x = x0 + square % kAcross * kSquare + pixel % kSquare;
-        const int y = y0 + square / kAcross * kSquare + pixel / kSquare;
-        place[i] = static_cast<size_t>(y) * kPicture + static_cast<size_t>(x);
-        rays[i] = camera.ray(x, y);
-        eye.set(i, rays[i]);
+        const Pixel pixel = pixel_of(x0, y0, i);
+        eye.set(i, mesh.view.eye, camera.direction(pixel.x, pixel.y), std::numeric_limits<float>::infinity());
     }
     eye.find_closest(kTilePixels);
     size_t count = 0;
     for (size_t i = 0; i < kTilePixels; ++i) {
-        picture[place[i]] = 0;
+        const Pixel pixel = pixel_of(x0, y0, i);
+        picture[pixel.place()] = 0;
         if (eye.face(i) == kNoFace) {
             continue;
         }
-        const SurfacePoint point(mesh.soup(), eye.face(i), rays[i], eye.t(i), offset);
-        const Ray ray = shadow_ray(point.position, mesh.view.light);
-        shade[count] = std::max(0.0F, dot(point.normal, normalize(ray.direction)));
-        lit[count] = place[i];
-        light.set(count++, ray);
+        const SurfacePoint point(mesh.soup(), eye.face(i), camera.ray(pixel.x, pixel.y), eye.t(i), offset);
+        const Vec3f to_light = mesh.view.light - point.position;
+        shade[count] = std::max(0.0F, dot(point.normal, normalize(to_light)));
+        lit[count] = pixel.place();
+        light.set(count++, point.position, to_light, 1);
     }
     light.find_any(count);
     for (size_t i = 0; i < count; ++i) {
