@@ -34,6 +34,7 @@ class Packet {
  public:
     /// Fewer share too little of their way; more lose where triangles are as small as pixels (OPTIMIZATION.md).
     static constexpr size_t kRays = 32;
+    static constexpr size_t kMostParts = 4;
 
     explicit Packet(const Tree& tree)
         : nodes_(tree.wide_nodes.data()),
@@ -43,54 +44,62 @@ class Packet {
 
     /// Sets the rays up if they make a packet.
     HWY_INLINE bool gather(const Ray* rays) {
-        const Ray& first = rays[0];
-        const Ray& last = rays[kRays - 1];
-        rays_ = rays;
-        if (first.origin == last.origin) {
-            return from_focus(first.origin);
-        }
-        if constexpr (kAnyHit) {
-            const Vec3f end = first.origin + first.direction;
-            const Vec3f off = last.origin + last.direction - end;
-            const float size = std::abs(end.x) + std::abs(end.y) + std::abs(end.z);
-            // Seen from farther away than any triangle may lie, products would overflow.
-            if (size <= kMaxCoordinate && std::abs(off.x) + std::abs(off.y) + std::abs(off.z) <= size * 0x1p-20F) {
-                return to_focus(end);
+        unpack(rays);
+        return set_up();
+    }
+
+    /// Sets up some of the rays, a bit each; the first of them stands in for those that are left out.
+    HWY_INLINE bool gather(const Ray* rays, uint32_t members) {
+        unpack(rays);
+        replace_all_but(members);
+        return set_up();
+    }
+
+    /// Parts rays that have a focus, but made no packet, by the way they run. Returns the number of parts, or 0 where
+    /// they would be too many.
+    HWY_NOINLINE size_t part(uint32_t (&parts)[kMostParts]) const {
+        static_assert(kRays == 32);
+        size_t count = 0;
+        for (uint32_t rest = has_focus_ ? ~0U : 0; rest != 0; rest &= ~parts[count++]) {
+            const uint32_t members = count == kMostParts ? 0 : like(static_cast<size_t>(std::countr_zero(rest))) & rest;
+            if (members == 0) {
+                return 0;
             }
+            parts[count] = members;
         }
-        return false;
+        return count;
     }
 
     /// Traces the rays that have been set up.
     HWY_INLINE void trace() {
         size_t stacked = 0;
-        uint32_t child = 0;
-        for (;;) {
-            if (WideNode::is_unopened(child)) [[unlikely]] {
-                child = on_demand_->open(child);
+        for (size_t pushed = stacked_;;) {
+            for (const size_t end = stacked + pushed; stacked != end; ++stacked) {
+                prefetch(places_[stacked]);
             }
-            if ((child & WideNode::kLeafFlag) == 0) {
-                const size_t pushed = visit_node(child, stacked);
-                for (size_t end = stacked + pushed; stacked != end; ++stacked) {
-                    prefetch(places_[stacked]);
-                }
-            } else {
-                const uint32_t first = WideNode::first_block(child);
-                const uint32_t end = first + WideNode::blocks(child);
-                for (uint32_t block = first; block < end; block += kBlocksPerStep) {
-                    visit_blocks(block, block + 1 < end ? 1 : 0);
-                }
-                if (kAnyHit && reach_ < 0) {
-                    return;
-                }
-            }
+            pushed = 0;
             do {
                 if (stacked == 0) {
                     return;
                 }
                 --stacked;
             } while (depths_[stacked] > reach_ || !any_enters(places_[stacked]));
-            child = nodes_[places_[stacked] / WideNode::kWidth].child[places_[stacked] % WideNode::kWidth];
+            uint32_t child = nodes_[places_[stacked] / WideNode::kWidth].child[places_[stacked] % WideNode::kWidth];
+            if (WideNode::is_unopened(child)) [[unlikely]] {
+                child = on_demand_->open(child);
+            }
+            if ((child & WideNode::kLeafFlag) == 0) {
+                pushed = visit_node(child, stacked);
+                continue;
+            }
+            const uint32_t first = WideNode::first_block(child);
+            const uint32_t end = first + WideNode::blocks(child);
+            for (uint32_t block = first; block < end; block += kBlocksPerStep) {
+                visit_blocks(block, block + 1 < end ? 1 : 0);
+            }
+            if (kAnyHit && reach_ < 0) {
+                return;
+            }
         }
     }
 
@@ -119,9 +128,10 @@ class Packet {
     static constexpr float kWidest = 0.125F;
 
     /// Lays the rays out component by component.
-    HWY_INLINE void unpack() {
+    HWY_INLINE void unpack(const Ray* rays) {
+        rays_ = rays;
         for (size_t lane = 0; lane < kRays; lane += kLanes) {
-            const RayColumns<V> given(d, rays_ + lane);
+            const RayColumns<V> given(d, rays + lane);
             for (size_t axis = 0; axis < 3; ++axis) {
                 hn::Store(given.origin[axis], d, origin_[axis] + lane);
                 hn::Store(given.direction[axis], d, direction_[axis] + lane);
@@ -131,24 +141,80 @@ class Packet {
         }
     }
 
-    /// Rays that start in one point.
-    HWY_INLINE bool from_focus(Vec3f focus) {
-        unpack();
+    HWY_INLINE Vec3f origin_of(size_t lane) const { return {origin_[0][lane], origin_[1][lane], origin_[2][lane]}; }
+    HWY_INLINE Vec3f direction_of(size_t lane) const {
+        return {direction_[0][lane], direction_[1][lane], direction_[2][lane]};
+    }
+
+    /// The rays, a bit each, that make a packet with this one.
+    HWY_INLINE uint32_t like(size_t leader) const {
+        const Way way(direction_of(leader));
+        uint32_t found = 0;
+        for (size_t lane = 0; lane < kRays; lane += kLanes) {
+            V off[2];
+            for (size_t i = 0; i < 2; ++i) {
+                const size_t axis = i == 0 ? way.axes.x : way.axes.y;
+                const V slope =
+                    hn::Div(hn::Load(d, direction_[axis] + lane), hn::Load(d, direction_[way.axes.z] + lane));
+                off[i] = hn::Abs(hn::Sub(slope, hn::Set(d, direction_[axis][leader] / direction_[way.axes.z][leader])));
+            }
+            const auto is_near = hn::Le(hn::Max(off[0], off[1]), hn::Set(d, kWidest / 2));
+            found |= mask_bits(d, hn::And(is_near, runs(way, lane))) << lane;
+        }
+        return found;
+    }
+
+    /// Replaces rays by the first of those that remain.
+    HWY_INLINE void replace_all_but(uint32_t members) {
+        const auto leader = static_cast<size_t>(std::countr_zero(members));
+        const auto replace = [&](float* values) {
+            const V value = hn::Set(d, values[leader]);
+            for (size_t lane = 0; lane < kRays; lane += kLanes) {
+                const auto stays = mask_of(d, members >> lane & static_cast<uint32_t>((uint64_t{1} << kLanes) - 1));
+                hn::Store(hn::IfThenElse(stays, hn::Load(d, values + lane), value), d, values + lane);
+            }
+        };
+        for (size_t axis = 0; axis < 3; ++axis) {
+            replace(origin_[axis]);
+            replace(direction_[axis]);
+        }
+        replace(t_min_);
+        replace(t_max_);
+    }
+
+    HWY_INLINE bool set_up() {
+        has_focus_ = false;
+        const Vec3f first = origin_of(0);
+        const Vec3f last = origin_of(kRays - 1);
+        if (first == last && all_start_at(first)) {
+            is_reversed_ = false;
+            return set_up_around(first, {0, 0, 0});
+        }
+        if constexpr (kAnyHit) {
+            const Vec3f end = first + direction_of(0);
+            const Vec3f off = last + direction_of(kRays - 1) - end;
+            const float size = std::abs(end.x) + std::abs(end.y) + std::abs(end.z);
+            // Seen from farther away than any triangle may lie, products would overflow.
+            if (size <= kMaxCoordinate && std::abs(off.x) + std::abs(off.y) + std::abs(off.z) <= size * 0x1p-20F) {
+                return to_focus(end);
+            }
+        }
+        return false;
+    }
+
+    HWY_INLINE bool all_start_at(Vec3f focus) const {
+        auto same = hn::FirstN(d, kLanes);
         for (size_t axis = 0; axis < 3; ++axis) {
             const V here = hn::Set(d, focus[static_cast<int>(axis)]);
             for (size_t lane = 0; lane < kRays; lane += kLanes) {
-                if (!hn::AllTrue(d, hn::Eq(hn::Load(d, origin_[axis] + lane), here))) {
-                    return false;
-                }
+                same = hn::And(same, hn::Eq(hn::Load(d, origin_[axis] + lane), here));
             }
         }
-        is_reversed_ = false;
-        return set_up(focus, {0, 0, 0});
+        return hn::AllTrue(d, same);
     }
 
     /// Rays that end, at t = 1, in one point up to rounding, and not behind it.
     HWY_INLINE bool to_focus(Vec3f focus) {
-        unpack();
         Vec3f deviation;
         for (size_t axis = 0; axis < 3; ++axis) {
             V largest = hn::Zero(d);
@@ -174,80 +240,83 @@ class Packet {
             }
         }
         is_reversed_ = true;
-        return set_up(focus, deviation);
+        return set_up_around(focus, deviation);
     }
 
-    HWY_INLINE bool set_up(Vec3f focus, Vec3f deviation) {
-        const Vec3f towards{direction_[0][0], direction_[1][0], direction_[2][0]};
-        const Axes axes(towards);
-        const auto kx = static_cast<int>(axes.x);
-        const auto ky = static_cast<int>(axes.y);
-        const auto kz = static_cast<int>(axes.z);
-        const Vec3f far_end{direction_[0][kRays - 1], direction_[1][kRays - 1], direction_[2][kRays - 1]};
-        focus_.slope_x = 0.5F * (towards[kx] / towards[kz] + far_end[kx] / far_end[kz]);
-        focus_.slope_y = 0.5F * (towards[ky] / towards[kz] + far_end[ky] / far_end[kz]);
-        V widest_x = hn::Zero(d);
-        V widest_y = hn::Zero(d);
+    /// The octant of a direction, and which of its components is the largest.
+    struct Way {
+        Axes axes;
+        Vec3f towards;
+
+        HWY_INLINE explicit Way(Vec3f direction) : axes(direction), towards(direction) {}
+    };
+
+    /// Which of the rays from `lane` on run that way, and are rays: what is none would take hits from those beside it.
+    HWY_INLINE hn::Mask<D> runs(const Way& way, size_t lane) const {
+        const V zero = hn::Zero(d);
+        const V along[3] = {hn::Load(d, direction_[0] + lane), hn::Load(d, direction_[1] + lane),
+                            hn::Load(d, direction_[2] + lane)};
+        const auto turns = [&](int axis) {
+            return way.towards[axis] < 0 ? hn::Ge(along[axis], zero) : hn::Lt(along[axis], zero);
+        };
+        const auto any_turns = hn::Or(turns(0), hn::Or(turns(1), turns(2)));
+        const V size = hn::Abs(hn::Load(d, direction_[way.axes.z] + lane));
+        const auto is_steep = hn::And(hn::Ge(size, largest_of(along)), hn::Gt(size, zero));
+        // Only what is neither infinite nor NaN is equal to itself after this.
+        const V all = hn::MulAdd(hn::Add(along[0], hn::Add(along[1], along[2])), zero,
+                                 hn::Add(hn::Load(d, t_min_ + lane), hn::Load(d, t_max_ + lane)));
+        return hn::AndNot(any_turns, hn::And(is_steep, hn::Eq(all, all)));
+    }
+
+    HWY_INLINE bool set_up_around(Vec3f focus, Vec3f deviation) {
+        has_focus_ = true;
+        const Way way(direction_of(0));
         for (size_t lane = 0; lane < kRays; lane += kLanes) {
-            const V dx = hn::Load(d, direction_[kx] + lane);
-            const V dy = hn::Load(d, direction_[ky] + lane);
-            const V dz = hn::Load(d, direction_[kz] + lane);
-            const auto largest_is_z = hn::Ge(hn::Abs(dz), hn::Max(hn::Abs(dx), hn::Abs(dy)));
-            const auto differs = [&](V v, float f) { return f < 0 ? hn::Ge(v, hn::Zero(d)) : hn::Lt(v, hn::Zero(d)); };
-            const auto turns =
-                hn::Or(differs(dx, towards[kx]), hn::Or(differs(dy, towards[ky]), differs(dz, towards[kz])));
-            const V sx = hn::Div(dx, dz);
-            const V sy = hn::Div(dy, dz);
-            const V off_x = hn::Sub(sx, hn::Set(d, focus_.slope_x));
-            const V off_y = hn::Sub(sy, hn::Set(d, focus_.slope_y));
-            // What is no ray would take hits from those beside it.
-            const V all =
-                hn::Add(hn::Add(off_x, off_y), hn::Add(hn::Load(d, t_min_ + lane), hn::Load(d, t_max_ + lane)));
-            if (!hn::AllTrue(d, hn::And(hn::AndNot(turns, largest_is_z), hn::Eq(all, all)))) {
+            if (!hn::AllTrue(d, runs(way, lane))) {
                 return false;
             }
-            widest_x = hn::Max(widest_x, hn::Abs(off_x));
-            widest_y = hn::Max(widest_y, hn::Abs(off_y));
-            hn::Store(sx, d, own_slope_x_ + lane);
-            hn::Store(sy, d, own_slope_y_ + lane);
-            hn::Store(hn::MulAdd(hn::Max(hn::Abs(sx), hn::Abs(sy)), hn::Set(d, 0x1p-24F), hn::Set(d, 0x1p-88F)), d,
-                      slant_ + lane);
-            hn::Store(off_x, d, off_x_ + lane);
-            hn::Store(off_y, d, off_y_ + lane);
         }
-        focus_.spread_x = hn::GetLane(hn::MaxOfLanes(d, widest_x)) * (1 + 0x1p-20F) + 0x1p-22F;
-        focus_.spread_y = hn::GetLane(hn::MaxOfLanes(d, widest_y)) * (1 + 0x1p-20F) + 0x1p-22F;
-        if (focus_.spread_x > kWidest || focus_.spread_y > kWidest) {
-            return false;
+        const Slabs slabs(*this, focus, deviation);
+        const auto kz = static_cast<int>(way.axes.z);
+        set_up_bounds(slabs, way, kz);
+        set_up_box_depths(kz, deviation[kz]);
+        stacked_ = visit_node(0, 0);
+        if (stacked_ == 0) {
+            return true;
         }
-        focus_.x = axes.x * kBlockSize;
-        focus_.y = axes.y * kBlockSize;
-        focus_.z = axes.z * kBlockSize;
-        focus_.at_x = focus[kx];
-        focus_.at_y = focus[ky];
-        focus_.at_z = focus[kz];
-        focus_.set_errors(deviation.x + deviation.y + deviation.z);
-        focus_.sign = towards[kz] < 0 ? -1.0F : 1.0F;
-        set_up_boxes(focus, deviation, towards, kz);
-        set_up_intervals(kz, deviation[kz]);
-        return true;
+        set_up_boxes(slabs, way);
+        set_up_depths(kz);
+        return set_up_view(way, focus, deviation);
     }
 
-    /// For the rays and for the two that bound them.
-    HWY_INLINE void set_up_boxes(Vec3f focus, Vec3f deviation, Vec3f towards, int kz) {
+    /// Where rays meet planes, given how steep they are.
+    struct Slabs {
+        float extent;
+        V farthest;
+        Vec3f focus;
+        Vec3f deviation;
+
+        HWY_INLINE Slabs(const Packet& packet, Vec3f f, Vec3f off)
+            : extent(packet.extent_),
+              farthest(hn::Set(d, extent + std::max({std::abs(f.x), std::abs(f.y), std::abs(f.z)}))),
+              focus(f),
+              deviation(off) {}
+
+        HWY_INLINE Slab<V> slab(const Way& way, int axis, V steepness) const {
+            const auto negative = hn::Lt(hn::Set(d, way.towards[axis]), hn::Zero(d));
+            return Slab<V>(hn::Set(d, focus[axis]), steepness, negative, extent, farthest, hn::Set(d, deviation[axis]));
+        }
+    };
+
+    /// For the two rays that bound the others. Leaves how steep each is.
+    HWY_INLINE void set_up_bounds(const Slabs& slabs, const Way& way, int kz) {
         octant_ = 0;
-        const V farthest = hn::Set(d, extent_ + std::max({std::abs(focus.x), std::abs(focus.y), std::abs(focus.z)}));
         for (int axis = 0; axis < 3; ++axis) {
-            const bool is_negative = towards[axis] < 0;
+            const bool is_negative = way.towards[axis] < 0;
             octant_ |= is_negative ? 1U << axis : 0U;
             const auto planes = static_cast<uint32_t>(axis * WideNode::kWidth);
             near_planes_[axis] = planes + (is_negative ? 3 * WideNode::kWidth : 0);
             far_planes_[axis] = planes + (is_negative ? 0 : 3 * WideNode::kWidth);
-            const auto negative = hn::Lt(hn::Set(d, towards[axis]), hn::Zero(d));
-            const auto slab_of = [&](V steepness) {
-                return Slab<V>(hn::Set(d, focus[axis]), steepness, negative, extent_, farthest,
-                               hn::Set(d, deviation[axis]));
-            };
             V least = hn::Set(d, kInfinity);
             V most = hn::Zero(d);
             for (size_t lane = 0; lane < kRays; lane += kLanes) {
@@ -257,14 +326,11 @@ class Packet {
                 const V steepness = axis == kz ? hn::Set(d, 1.0F) : hn::Div(largest, own);
                 least = hn::Min(least, steepness);
                 most = hn::Max(most, steepness);
-                const Slab<V> slab = slab_of(steepness);
-                hn::Store(slab.inverse, d, inverse_[axis] + lane);
-                hn::Store(slab.near_shift, d, near_shift_[axis] + lane);
-                hn::Store(slab.far_shift, d, far_shift_[axis] + lane);
+                hn::Store(steepness, d, inverse_[axis] + lane);
             }
             const V ends[2] = {hn::MinOfLanes(d, least), hn::MaxOfLanes(d, most)};
             for (size_t end = 0; end < 2; ++end) {
-                const Slab<V> slab = slab_of(ends[end]);
+                const Slab<V> slab = slabs.slab(way, axis, ends[end]);
                 bound_inverse_[axis][end] = hn::GetLane(slab.inverse);
                 bound_near_[axis][end] = hn::GetLane(slab.near_shift);
                 bound_far_[axis][end] = hn::GetLane(slab.far_shift);
@@ -272,34 +338,98 @@ class Packet {
         }
     }
 
-    /// The depths at which boxes count, seen from the focus, and those at which triangles do, seen from each origin.
-    HWY_INLINE void set_up_intervals(int kz, float deviation) {
+    /// For each ray, by how steep it is.
+    HWY_INLINE void set_up_boxes(const Slabs& slabs, const Way& way) {
+        for (int axis = 0; axis < 3; ++axis) {
+            for (size_t lane = 0; lane < kRays; lane += kLanes) {
+                const Slab<V> slab = slabs.slab(way, axis, hn::Load(d, inverse_[axis] + lane));
+                hn::Store(slab.inverse, d, inverse_[axis] + lane);
+                hn::Store(slab.near_shift, d, near_shift_[axis] + lane);
+                hn::Store(slab.far_shift, d, far_shift_[axis] + lane);
+            }
+        }
+    }
+
+    HWY_INLINE DepthLimits<V> limits_of(int kz, size_t lane) const {
+        return DepthLimits<V>(hn::Load(d, t_min_ + lane), hn::Load(d, t_max_ + lane),
+                              hn::Abs(hn::Load(d, direction_[kz] + lane)));
+    }
+
+    /// The depths at which boxes count, seen from the focus. No ray has hit anything.
+    HWY_INLINE void set_up_box_depths(int kz, float deviation) {
         V least = hn::Set(d, kInfinity);
         for (size_t lane = 0; lane < kRays; lane += kLanes) {
-            const V size = hn::Abs(hn::Load(d, direction_[kz] + lane));
-            const V t_min = hn::Load(d, t_min_ + lane);
-            const V t_max = hn::Load(d, t_max_ + lane);
-            const DepthLimits<V> limits(t_min, t_max, size);
-            hn::Store(limits.start, d, start_ + lane);
-            hn::Store(limits.reach, d, reaches_ + lane);
-            hn::Store(limits.sure_start, d, sure_start_ + lane);
-            hn::Store(limits.sure_end, d, sure_before_ + lane);
-            hn::Store(hn::Set(du, kNoPlace), du, place_ + lane);
-            hn::Store(hn::Set(du, kNoTriangle), du, triangle_ + lane);
+            const DepthLimits<V> limits = limits_of(kz, lane);
             V box_start = limits.start;
             V box_reach = limits.reach;
             if (is_reversed_) {
+                const V size = hn::Abs(hn::Load(d, direction_[kz] + lane));
                 const V one = hn::Set(d, 1.0F);
                 const V room = hn::MulAdd(size, hn::Set(d, 0x1p-21F), hn::Set(d, deviation));
-                box_start = hn::Sub(hn::Mul(hn::Sub(one, t_max), size), room);
-                box_reach = hn::MulAdd(hn::Sub(one, t_min), size, room);
+                box_start = hn::Sub(hn::Mul(hn::Sub(one, hn::Load(d, t_max_ + lane)), size), room);
+                box_reach = hn::MulAdd(hn::Sub(one, hn::Load(d, t_min_ + lane)), size, room);
             }
             hn::Store(box_start, d, box_start_ + lane);
             hn::Store(box_reach, d, box_reach_ + lane);
+            hn::Store(hn::Set(du, kNoPlace), du, place_ + lane);
+            hn::Store(hn::Set(du, kNoTriangle), du, triangle_ + lane);
             least = hn::Min(least, box_start);
         }
         entry_ = hn::GetLane(hn::MinOfLanes(d, least));
         update_reach();
+    }
+
+    /// The depths at which triangles count, seen from each origin.
+    HWY_INLINE void set_up_depths(int kz) {
+        for (size_t lane = 0; lane < kRays; lane += kLanes) {
+            const DepthLimits<V> limits = limits_of(kz, lane);
+            hn::Store(limits.start, d, start_ + lane);
+            hn::Store(limits.reach, d, reaches_ + lane);
+            hn::Store(limits.sure_start, d, sure_start_ + lane);
+            hn::Store(limits.sure_end, d, sure_before_ + lane);
+        }
+    }
+
+    /// From the focus towards triangles, along all rays; false if they differ too much.
+    HWY_INLINE bool set_up_view(const Way& way, Vec3f focus, Vec3f deviation) {
+        const auto kx = static_cast<int>(way.axes.x);
+        const auto ky = static_cast<int>(way.axes.y);
+        const auto kz = static_cast<int>(way.axes.z);
+        V widest_x = hn::Zero(d);
+        V widest_y = hn::Zero(d);
+        for (size_t lane = 0; lane < kRays; lane += kLanes) {
+            const V dz = hn::Load(d, direction_[kz] + lane);
+            const V sx = hn::Div(hn::Load(d, direction_[kx] + lane), dz);
+            const V sy = hn::Div(hn::Load(d, direction_[ky] + lane), dz);
+            hn::Store(sx, d, own_slope_x_ + lane);
+            hn::Store(sy, d, own_slope_y_ + lane);
+            hn::Store(hn::MulAdd(hn::Max(hn::Abs(sx), hn::Abs(sy)), hn::Set(d, 0x1p-24F), hn::Set(d, 0x1p-88F)), d,
+                      slant_ + lane);
+        }
+        focus_.slope_x = 0.5F * (own_slope_x_[0] + own_slope_x_[kRays - 1]);
+        focus_.slope_y = 0.5F * (own_slope_y_[0] + own_slope_y_[kRays - 1]);
+        for (size_t lane = 0; lane < kRays; lane += kLanes) {
+            const V off_x = hn::Sub(hn::Load(d, own_slope_x_ + lane), hn::Set(d, focus_.slope_x));
+            const V off_y = hn::Sub(hn::Load(d, own_slope_y_ + lane), hn::Set(d, focus_.slope_y));
+            widest_x = hn::Max(widest_x, hn::Abs(off_x));
+            widest_y = hn::Max(widest_y, hn::Abs(off_y));
+            hn::Store(off_x, d, off_x_ + lane);
+            hn::Store(off_y, d, off_y_ + lane);
+        }
+        focus_.spread_x = hn::GetLane(hn::MaxOfLanes(d, widest_x)) * (1 + 0x1p-20F) + 0x1p-22F;
+        focus_.spread_y = hn::GetLane(hn::MaxOfLanes(d, widest_y)) * (1 + 0x1p-20F) + 0x1p-22F;
+        if (focus_.spread_x > kWidest || focus_.spread_y > kWidest) {
+            return false;
+        }
+        focus_.x = way.axes.x * kBlockSize;
+        focus_.y = way.axes.y * kBlockSize;
+        focus_.z = way.axes.z * kBlockSize;
+        focus_.at_x = focus[kx];
+        focus_.at_y = focus[ky];
+        focus_.at_z = focus[kz];
+        focus_.set_errors(deviation.x + deviation.y + deviation.z);
+        focus_.sign = way.towards[kz] < 0 ? -1.0F : 1.0F;
+        return true;
     }
 
     HWY_INLINE void update_reach() {
@@ -562,8 +692,10 @@ class Packet {
     OnDemand* on_demand_;
     const Ray* rays_ = nullptr;
     float extent_;
+    bool has_focus_ = false;
     bool is_reversed_ = false;  ///< the focus is where the rays end
     uint32_t octant_ = 0;
+    size_t stacked_ = 0;  ///< children of the root that are to be visited
     uint32_t near_planes_[3], far_planes_[3];
     float bound_inverse_[3][2], bound_near_[3][2], bound_far_[3][2];  ///< of the least and the most steep ray
     float entry_, reach_;                                             ///< no box counts outside these depths

@@ -11,6 +11,7 @@
 #include <hwy/highway.h>
 
 #include <algorithm>
+#include <bit>
 #include <cstdint>
 #include <span>
 
@@ -21,6 +22,24 @@
 
 HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
+
+/// Traces rays that are no packet as a few that are, one after the other, if there are such. Returns whether it did.
+template <class SomePacket, class Ends>
+HWY_INLINE bool trace_parts(SomePacket& packet, const Ray* rays, uint32_t first, Ends& ends) {
+    uint32_t parts[SomePacket::kMostParts];
+    const size_t count = packet.part(parts);
+    for (size_t i = 0; i < count; ++i) {
+        if (!packet.gather(rays, parts[i])) {
+            return false;
+        }
+        packet.trace();
+        for (uint32_t rest = parts[i]; rest != 0; rest &= rest - 1) {
+            const auto lane = static_cast<uint32_t>(std::countr_zero(rest));
+            ends.add(first + lane, packet.place(lane));
+        }
+    }
+    return count != 0;
+}
 
 /// Traces rays that belong together as packets and all others as a stream. Calls ends.add(ray, place) for each, or
 /// ends.add(first, packet) for those of a packet.
@@ -36,10 +55,11 @@ HWY_INLINE void trace(const Tree& tree, std::span<const Ray> rays, Ends& ends) {
         const size_t end = std::min(begin + kChunk, rays.size());
         size_t count = 0;
         for (size_t i = begin; i < end; i += kPacket) {
-            if (i + kPacket <= end && packet.gather(&rays[i])) {
+            const bool is_full = i + kPacket <= end;
+            if (is_full && packet.gather(&rays[i])) {
                 packet.trace();
                 ends.add(static_cast<uint32_t>(i), packet);
-            } else {
+            } else if (!is_full || !trace_parts(packet, &rays[i], static_cast<uint32_t>(i), ends)) {
                 for (size_t first = i; first < std::min(i + kPacket, end); first += RayBatch::kSize) {
                     batches[count++] = static_cast<uint32_t>(first);
                 }

@@ -457,6 +457,40 @@ TEST(Traversal, RaysOfOnePacketMayStartApart) {
     }
 }
 
+/// Rays of one packet that run into so many octants, in turn: what they hit is what each hits alone.
+TEST(Traversal, RaysOfOnePacketMayPart) {
+    const Mesh mesh = make_sphere(24, 32);
+    const Tree tree = build(mesh.soup(), {});
+    const Vec3f eye{0.01F, 0.02F, -0.03F};
+    std::mt19937 random(6);
+    std::uniform_real_distribution<float> uniform(-0.03F, 0.03F);
+    for (uint32_t parts = 1; parts <= 8; ++parts) {
+        std::vector<Ray> rays;
+        for (uint32_t i = 0; i < 64; ++i) {
+            const uint32_t octant = i * 5 % parts;
+            const Vec3f way{(octant & 1U) != 0 ? 1.0F : -1.0F, (octant & 2U) != 0 ? 0.7F : -0.7F,
+                            (octant & 4U) != 0 ? 0.8F : -0.8F};
+            const Vec3f end = way + Vec3f{uniform(random), uniform(random), uniform(random)};
+            if (i < 32) {
+                rays.push_back({eye, 0, end, i % 3 == 0 ? 0.5F : INFINITY});
+            } else {
+                rays.push_back({eye + end * (i % 3 == 0 ? 0.5F : 2.0F), 0, end * (i % 3 == 0 ? -0.5F : -2.0F), 1});
+            }
+        }
+        std::vector<Hit> hits(rays.size());
+        std::vector<uint8_t> blocked(rays.size());
+        intersect(tree, rays, hits);
+        occluded(tree, rays, blocked);
+        for (size_t i = 0; i < rays.size(); ++i) {
+            Hit alone{};
+            intersect(tree, {&rays[i], 1}, {&alone, 1});
+            EXPECT_EQ(alone.triangle < 0, i % 3 == 0) << i;
+            EXPECT_TRUE(is_same(alone, hits[i])) << i;
+            EXPECT_EQ(blocked[i], alone.triangle >= 0 ? 1 : 0) << i;
+        }
+    }
+}
+
 TEST(Traversal, ClosedMeshIsWatertight) {
     const Mesh mesh = make_sphere(48, 64);
     const Tree tree = build(mesh.soup(), {});
