@@ -30,7 +30,7 @@ class Pinhole {
     Vec3f direction(int x, int y) const {
         const float across = 2 * (static_cast<float>(x) + 0.5F) / kPicture - 1;
         const float along = 2 * (static_cast<float>(y) + 0.5F) / kPicture - 1;
-        return forward_ + right_ * across + down_ * along;
+        return forward_ + down_ * along + right_ * across;
     }
     Ray ray(int x, int y) const { return {eye_, 0, direction(x, y), std::numeric_limits<float>::infinity()}; }
 

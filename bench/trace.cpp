@@ -216,18 +216,19 @@ class EmbreeBatch {
     std::array<typename Packet<kWidth>::RayHits, kTilePixels / kWidth> packets_;
 };
 
-struct Pixel {
-    int x, y;
-
-    size_t place() const { return static_cast<size_t>(y) * kPicture + static_cast<size_t>(x); }
-};
-
-/// The pixels of a tile come square by square.
-Pixel pixel_of(int x0, int y0, size_t i) {
-    constexpr int kAcross = kTile / kSquare;
-    const int square = static_cast<int>(i) / (kSquare * kSquare);
-    const int pixel = static_cast<int>(i) % (kSquare * kSquare);
-    return {x0 + square % kAcross * kSquare + pixel % kSquare, y0 + square / kAcross * kSquare + pixel / kSquare};
+/// Calls f(number, x, y) for the pixels of a tile, square by square.
+template <class F>
+void each_pixel(int x0, int y0, const F& f) {
+    size_t i = 0;
+    for (int square_y = y0; square_y < y0 + kTile; square_y += kSquare) {
+        for (int square_x = x0; square_x < x0 + kTile; square_x += kSquare) {
+            for (int y = square_y; y < square_y + kSquare; ++y) {
+                for (int x = square_x; x < square_x + kSquare; ++x) {
+                    f(i++, x, y);
+                }
+            }
+        }
+    }
 }
 
 /// One tile: closest hits, a shadow ray from each of them, and light by Lambert's law.
@@ -236,24 +237,23 @@ void draw_tile(const Mesh& mesh, const Pinhole& camera, float offset, int x0, in
                std::vector<float>& picture) {
     std::array<float, kTilePixels> shade;
     std::array<size_t, kTilePixels> lit;
-    for (size_t i = 0; i < kTilePixels; ++i) {
-        const Pixel pixel = pixel_of(x0, y0, i);
-        eye.set(i, mesh.view.eye, camera.direction(pixel.x, pixel.y), std::numeric_limits<float>::infinity());
-    }
+    each_pixel(x0, y0, [&](size_t i, int x, int y) {
+        eye.set(i, mesh.view.eye, camera.direction(x, y), std::numeric_limits<float>::infinity());
+    });
     eye.find_closest(kTilePixels);
     size_t count = 0;
-    for (size_t i = 0; i < kTilePixels; ++i) {
-        const Pixel pixel = pixel_of(x0, y0, i);
-        picture[pixel.place()] = 0;
+    each_pixel(x0, y0, [&](size_t i, int x, int y) {
+        const size_t place = static_cast<size_t>(y) * kPicture + static_cast<size_t>(x);
+        picture[place] = 0;
         if (eye.face(i) == kNoFace) {
-            continue;
+            return;
         }
-        const SurfacePoint point(mesh.soup(), eye.face(i), camera.ray(pixel.x, pixel.y), eye.t(i), offset);
+        const SurfacePoint point(mesh.soup(), eye.face(i), camera.ray(x, y), eye.t(i), offset);
         const Vec3f to_light = mesh.view.light - point.position;
-        shade[count] = std::max(0.0F, dot(point.normal, normalize(to_light)));
-        lit[count] = pixel.place();
+        shade[count] = std::max(0.0F, dot(point.normal, to_light) / length(to_light));
+        lit[count] = place;
         light.set(count++, point.position, to_light, 1);
-    }
+    });
     light.find_any(count);
     for (size_t i = 0; i < count; ++i) {
         picture[lit[i]] = light.blocked(i) ? 0 : shade[i];

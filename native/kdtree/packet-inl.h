@@ -45,6 +45,9 @@ class Packet {
     /// Sets the rays up if they make a packet.
     HWY_INLINE bool gather(const Ray* rays) {
         unpack(rays);
+        for (size_t lane = 0; lane < kRays; lane += 64 / sizeof(Ray)) {
+            __builtin_prefetch(rays + kRays + lane);  // the next packet's
+        }
         return set_up();
     }
 
