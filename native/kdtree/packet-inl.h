@@ -126,6 +126,7 @@ class Packet {
     static constexpr D d{};                         // NOLINT(readability-identifier-naming): as in functions
     static constexpr hn::RebindToUnsigned<D> du{};  // NOLINT(readability-identifier-naming)
     static constexpr size_t kLanes = hn::MaxLanes(D());
+    static constexpr auto kLaneBits = static_cast<uint32_t>((uint64_t{1} << kLanes) - 1);
     static constexpr size_t kCapacity = 70 * (WideNode::kWidth - 1) + 3 * WideNode::kWidth;
     /// Directions that differ by more are no packet.
     static constexpr float kWidest = 0.125F;
@@ -173,7 +174,7 @@ class Packet {
         const auto replace = [&](float* values) {
             const V value = hn::Set(d, values[leader]);
             for (size_t lane = 0; lane < kRays; lane += kLanes) {
-                const auto stays = mask_of(d, members >> lane & static_cast<uint32_t>((uint64_t{1} << kLanes) - 1));
+                const auto stays = mask_of(d, members >> lane & kLaneBits);
                 hn::Store(hn::IfThenElse(stays, hn::Load(d, values + lane), value), d, values + lane);
             }
         };
@@ -535,17 +536,25 @@ class Packet {
         View view;
         uint32_t reached = view.look(focus_, BlockLoader(blocks_ + index, second), entry_, reach_);
         reached &= (1U << (kBlockSize * (1 + second))) - 1;
-        // First which of them some ray meets, without a branch for each: those are hard to foresee.
+        // First which of them rays meet, without a branch for each: those are hard to foresee.
         uint32_t met[View::kSize];
+        uint32_t meeting[View::kSize];
         size_t count = 0;
         for (; reached != 0; reached &= reached - 1) {
-            const auto lane = static_cast<uint32_t>(std::countr_zero(reached));
-            met[count] = lane;
-            count += any_meets(view, lane) ? 1 : 0;
+            met[count] = static_cast<uint32_t>(std::countr_zero(reached));
+            meeting[count] = rays_meeting(view, met[count]);
+            count += meeting[count] != 0 ? 1 : 0;
         }
         bool taken = false;
         for (size_t i = 0; i < count; ++i) {
-            taken |= test_from_focus(view, met[i], index * kBlockSize + met[i]);
+            const uint32_t place = index * kBlockSize + met[i];
+            for (size_t lane = 0; lane < kRays; lane += kLanes) {
+                if ((meeting[i] >> lane & kLaneBits) == 0) {
+                    continue;
+                }
+                taken |= kAnyHit && is_reversed_ ? test_from_origins(lane, place)
+                                                 : test_from_focus(view, met[i], lane, place);
+            }
         }
         if (taken) {
             update_reach();
@@ -561,53 +570,41 @@ class Packet {
         return kAnyHit ? hn::And(inside, hn::Ge(hn::Load(d, reaches_ + lane), hn::Zero(d))) : inside;
     }
 
-    HWY_INLINE bool any_meets(const View& view, uint32_t triangle) const {
-        uint32_t meets = 0;
+    /// The rays, a bit each, that may meet a triangle.
+    HWY_INLINE uint32_t rays_meeting(const View& view, uint32_t triangle) const {
+        uint32_t meeting = 0;
         for (size_t lane = 0; lane < kRays; lane += kLanes) {
             V side[3];
             sides_from_focus(view, triangle, lane, side);
-            meets |= mask_bits(d, may_meet(side, hn::Set(d, view.bound[triangle]), lane));
+            meeting |= mask_bits(d, may_meet(side, hn::Set(d, view.bound[triangle]), lane)) << lane;
         }
-        return meets != 0;
+        return meeting;
     }
 
-    HWY_INLINE bool test_from_focus(const View& view, uint32_t triangle, uint32_t place) {
-        bool taken = false;
-        for (size_t lane = 0; lane < kRays; lane += kLanes) {
-            V side[3];
-            sides_from_focus(view, triangle, lane, side);
-            const V bound = hn::Set(d, view.bound[triangle]);
-            const auto inside = may_meet(side, bound, lane);
-            if (kLanes != kRays && hn::AllFalse(d, inside)) {
-                continue;
-            }
-            if (kAnyHit && is_reversed_) {
-                taken |= test_from_origins(lane, place);
-                continue;
-            }
-            // Where the view from the packet's middle is too coarse for one of the rays, their own are finer.
-            const V det = hn::Add(side[0], hn::Add(side[1], side[2]));
-            const auto is_clear =
-                hn::And(hn::Gt(depth_inside(side), bound), hn::Ge(hn::Abs(det), hn::Mul(bound, hn::Set(d, 64))));
-            if (kExact && !hn::AllFalse(d, hn::AndNot(is_clear, inside))) {
-                taken |= test_from_origins(lane, place);
-                continue;
-            }
-            // As depth_range has it, but all that counts is sound, and much of it the same for all rays.
-            const float r1 = view.depth[1][triangle];
-            const float r2 = view.depth[2][triangle];
-            const V inverse = hn::Div(hn::Set(d, 1), det);
-            const V depth =
-                depth_of(side, inverse, hn::Set(d, view.depth[0][triangle]), hn::Set(d, r1), hn::Set(d, r2));
-            V error = hn::Zero(d);
-            if constexpr (kExact) {
-                error = hn::MulAdd(hn::Mul(bound, hn::Abs(inverse)),
-                                   hn::Set(d, kErrorOfWeights * std::max(std::abs(r1), std::abs(r2))),
-                                   hn::Set(d, kErrorOfRounding * view.size[triangle] + kTiny));
-            }
-            taken |= take(lane, hn::Sub(depth, error), hn::Add(depth, error), inside, inside, place);
+    HWY_INLINE bool test_from_focus(const View& view, uint32_t triangle, size_t lane, uint32_t place) {
+        V side[3];
+        sides_from_focus(view, triangle, lane, side);
+        const V bound = hn::Set(d, view.bound[triangle]);
+        const auto inside = may_meet(side, bound, lane);
+        // Where the view from the packet's middle is too coarse for one of the rays, their own are finer.
+        const V det = hn::Add(side[0], hn::Add(side[1], side[2]));
+        const auto is_clear =
+            hn::And(hn::Gt(depth_inside(side), bound), hn::Ge(hn::Abs(det), hn::Mul(bound, hn::Set(d, 64))));
+        if (kExact && !hn::AllFalse(d, hn::AndNot(is_clear, inside))) {
+            return test_from_origins(lane, place);
         }
-        return taken;
+        // As depth_range has it, but all that counts is sound, and much of it the same for all rays.
+        const float r1 = view.depth[1][triangle];
+        const float r2 = view.depth[2][triangle];
+        const V inverse = hn::Div(hn::Set(d, 1), det);
+        const V depth = depth_of(side, inverse, hn::Set(d, view.depth[0][triangle]), hn::Set(d, r1), hn::Set(d, r2));
+        V error = hn::Zero(d);
+        if constexpr (kExact) {
+            error = hn::MulAdd(hn::Mul(bound, hn::Abs(inverse)),
+                               hn::Set(d, kErrorOfWeights * std::max(std::abs(r1), std::abs(r2))),
+                               hn::Set(d, kErrorOfRounding * view.size[triangle] + kTiny));
+        }
+        return take(lane, hn::Sub(depth, error), hn::Add(depth, error), inside, inside, place);
     }
 
     /// One triangle against each ray from its own origin, as test_blocks has it.
