@@ -12,11 +12,11 @@ DEFAULT_MODE = "balanced"
 NOT_EXACT = "not exact"  # the same tracer, on the same tree, without what makes hits exact
 
 ABOUT = (
-    "Contestants take turns in one process. Times are medians (least to greatest); ratios are medians of the ratios "
-    "within a turn and tell how many times as fast one is as the other. Both sides get fresh memory while the clock "
-    "runs, the same threads and the same instruction set. Our builds go by the builder's own clock, which leaves out "
-    "the report's checksum and cost; pictures go by the wall's. Embree LOW and MEDIUM build a ROBUST scene, HIGH one "
-    "that is not, since ROBUST turns its spatial splits off."
+    "Contestants take turns in one process, every other turn in reverse. Times are medians (least to greatest); ratios "
+    "are medians of the ratios within a turn and tell how many times as fast one is as the other. Both sides get fresh "
+    "memory while the clock runs, the same threads and the same instruction set. Our builds go by the builder's own "
+    "clock, which leaves out the report's checksum and cost; pictures go by the wall's. Embree LOW and MEDIUM build a "
+    "ROBUST scene, HIGH one that is not, since ROBUST turns its spatial splits off."
 )
 
 
