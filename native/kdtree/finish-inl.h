@@ -134,7 +134,8 @@ struct HitColumns {
         const hn::RebindToUnsigned<decltype(d)> du;
         for (size_t lane = 0; lane < kSize; lane += hn::Lanes(d)) {
             hn::StoreInterleaved4(hn::Load(d, t + lane), hn::Load(d, u + lane), hn::Load(d, v + lane),
-                                  hn::BitCast(d, hn::Load(du, triangles + lane)), d, &hits[lane].t);
+                                  hn::BitCast(d, hn::Load(du, triangles + lane)), d,
+                                  reinterpret_cast<float*>(hits + lane));
         }
     }
 };

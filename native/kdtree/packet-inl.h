@@ -51,10 +51,10 @@ class Packet {
         return set_up();
     }
 
-    /// Sets up some of the rays, a bit each; the first of them stands in for those that are left out.
+    /// Sets up some of the rays, a bit each.
     HWY_INLINE bool gather(const Ray* rays, uint32_t members) {
         unpack(rays);
-        replace_all_but(members);
+        leave_out_all_but(members);
         return set_up();
     }
 
@@ -63,12 +63,14 @@ class Packet {
     HWY_NOINLINE size_t part(uint32_t (&parts)[kMostParts]) const {
         static_assert(kRays == 32);
         size_t count = 0;
-        for (uint32_t rest = has_focus_ ? ~0U : 0; rest != 0; rest &= ~parts[count++]) {
-            const uint32_t members = count == kMostParts ? 0 : like(static_cast<size_t>(std::countr_zero(rest))) & rest;
-            if (members == 0) {
+        uint32_t rest = has_focus_ ? ~0U : 0;
+        while (rest != 0) {
+            const uint32_t members = like(static_cast<size_t>(std::countr_zero(rest))) & rest;
+            if (members == 0 || count == kMostParts) {
                 return 0;
             }
-            parts[count] = members;
+            parts[count++] = members;
+            rest &= ~members;
         }
         return count;
     }
@@ -168,22 +170,22 @@ class Packet {
         return found;
     }
 
-    /// Replaces rays by the first of those that remain.
-    HWY_INLINE void replace_all_but(uint32_t members) {
+    /// Puts rays that end before they begin, and else are as the first of those that remain, in place of the others.
+    HWY_INLINE void leave_out_all_but(uint32_t members) {
         const auto leader = static_cast<size_t>(std::countr_zero(members));
-        const auto replace = [&](float* values) {
-            const V value = hn::Set(d, values[leader]);
+        const auto replace = [&](float* values, float by) {
+            const V value = hn::Set(d, by);
             for (size_t lane = 0; lane < kRays; lane += kLanes) {
                 const auto stays = mask_of(d, members >> lane & kLaneBits);
                 hn::Store(hn::IfThenElse(stays, hn::Load(d, values + lane), value), d, values + lane);
             }
         };
         for (size_t axis = 0; axis < 3; ++axis) {
-            replace(origin_[axis]);
-            replace(direction_[axis]);
+            replace(origin_[axis], origin_[axis][leader]);
+            replace(direction_[axis], direction_[axis][leader]);
         }
-        replace(t_min_);
-        replace(t_max_);
+        replace(t_min_, 0);
+        replace(t_max_, -1);
     }
 
     HWY_INLINE bool set_up() {
@@ -247,12 +249,18 @@ class Packet {
         return set_up_around(focus, deviation);
     }
 
-    /// The octant of a direction, and which of its components is the largest.
+    /// A direction, by its signs and by which of its components is the largest.
     struct Way {
         Axes axes;
         Vec3f towards;
+        int x, y, z;
 
-        HWY_INLINE explicit Way(Vec3f direction) : axes(direction), towards(direction) {}
+        HWY_INLINE explicit Way(Vec3f direction)
+            : axes(direction),
+              towards(direction),
+              x(static_cast<int>(axes.x)),
+              y(static_cast<int>(axes.y)),
+              z(static_cast<int>(axes.z)) {}
     };
 
     /// Which of the rays from `lane` on run that way, and are rays: what is none would take hits from those beside it.
@@ -266,7 +274,7 @@ class Packet {
         const auto any_turns = hn::Or(turns(0), hn::Or(turns(1), turns(2)));
         const V size = hn::Abs(hn::Load(d, direction_[way.axes.z] + lane));
         const auto is_steep = hn::And(hn::Ge(size, largest_of(along)), hn::Gt(size, zero));
-        // Only what is neither infinite nor NaN is equal to itself after this.
+        // Not equal to itself where the direction has an infinite component or a NaN, or t is NaN.
         const V all = hn::MulAdd(hn::Add(along[0], hn::Add(along[1], along[2])), zero,
                                  hn::Add(hn::Load(d, t_min_ + lane), hn::Load(d, t_max_ + lane)));
         return hn::AndNot(any_turns, hn::And(is_steep, hn::Eq(all, all)));
@@ -281,15 +289,14 @@ class Packet {
             }
         }
         const Slabs slabs(*this, focus, deviation);
-        const auto kz = static_cast<int>(way.axes.z);
-        set_up_bounds(slabs, way, kz);
-        set_up_box_depths(kz, deviation[kz]);
+        set_up_bounds(slabs, way);
+        set_up_box_depths(way.z, deviation[way.z]);
         stacked_ = visit_node(0, 0);
         if (stacked_ == 0) {
             return true;
         }
         set_up_boxes(slabs, way);
-        set_up_depths(kz);
+        set_up_depths(way.z);
         return set_up_view(way, focus, deviation);
     }
 
@@ -313,7 +320,7 @@ class Packet {
     };
 
     /// For the two rays that bound the others. Leaves how steep each is.
-    HWY_INLINE void set_up_bounds(const Slabs& slabs, const Way& way, int kz) {
+    HWY_INLINE void set_up_bounds(const Slabs& slabs, const Way& way) {
         octant_ = 0;
         for (int axis = 0; axis < 3; ++axis) {
             const bool is_negative = way.towards[axis] < 0;
@@ -324,10 +331,10 @@ class Packet {
             V least = hn::Set(d, kInfinity);
             V most = hn::Zero(d);
             for (size_t lane = 0; lane < kRays; lane += kLanes) {
-                const V largest = hn::Abs(hn::Load(d, direction_[kz] + lane));
+                const V largest = hn::Abs(hn::Load(d, direction_[way.z] + lane));
                 const V own =
                     hn::Max(hn::Abs(hn::Load(d, direction_[axis] + lane)), hn::Mul(largest, hn::Set(d, 0x1p-25F)));
-                const V steepness = axis == kz ? hn::Set(d, 1.0F) : hn::Div(largest, own);
+                const V steepness = axis == way.z ? hn::Set(d, 1.0F) : hn::Div(largest, own);
                 least = hn::Min(least, steepness);
                 most = hn::Max(most, steepness);
                 hn::Store(steepness, d, inverse_[axis] + lane);
@@ -396,15 +403,12 @@ class Packet {
 
     /// From the focus towards triangles, along all rays; false if they differ too much.
     HWY_INLINE bool set_up_view(const Way& way, Vec3f focus, Vec3f deviation) {
-        const auto kx = static_cast<int>(way.axes.x);
-        const auto ky = static_cast<int>(way.axes.y);
-        const auto kz = static_cast<int>(way.axes.z);
         V widest_x = hn::Zero(d);
         V widest_y = hn::Zero(d);
         for (size_t lane = 0; lane < kRays; lane += kLanes) {
-            const V dz = hn::Load(d, direction_[kz] + lane);
-            const V sx = hn::Div(hn::Load(d, direction_[kx] + lane), dz);
-            const V sy = hn::Div(hn::Load(d, direction_[ky] + lane), dz);
+            const V dz = hn::Load(d, direction_[way.z] + lane);
+            const V sx = hn::Div(hn::Load(d, direction_[way.x] + lane), dz);
+            const V sy = hn::Div(hn::Load(d, direction_[way.y] + lane), dz);
             hn::Store(sx, d, own_slope_x_ + lane);
             hn::Store(sy, d, own_slope_y_ + lane);
             hn::Store(hn::MulAdd(hn::Max(hn::Abs(sx), hn::Abs(sy)), hn::Set(d, 0x1p-24F), hn::Set(d, 0x1p-88F)), d,
@@ -428,11 +432,11 @@ class Packet {
         focus_.x = way.axes.x * kBlockSize;
         focus_.y = way.axes.y * kBlockSize;
         focus_.z = way.axes.z * kBlockSize;
-        focus_.at_x = focus[kx];
-        focus_.at_y = focus[ky];
-        focus_.at_z = focus[kz];
+        focus_.at_x = focus[way.x];
+        focus_.at_y = focus[way.y];
+        focus_.at_z = focus[way.z];
         focus_.set_errors(deviation.x + deviation.y + deviation.z);
-        focus_.sign = way.towards[kz] < 0 ? -1.0F : 1.0F;
+        focus_.sign = way.towards[way.z] < 0 ? -1.0F : 1.0F;
         return true;
     }
 

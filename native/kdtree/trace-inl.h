@@ -23,9 +23,10 @@
 HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
 
-/// Traces rays that are no packet as a few that are, one after the other, if there are such. Returns whether it did.
+/// Traces rays that are no packet as a few that are, one after the other, if there are such. Returns whether it has
+/// traced all; if not, some may have been, and come to the same end once more.
 template <class SomePacket, class Ends>
-HWY_INLINE bool trace_parts(SomePacket& packet, const Ray* rays, uint32_t first, Ends& ends) {
+HWY_NOINLINE bool trace_parts(SomePacket& packet, const Ray* rays, uint32_t first, Ends& ends) {
     uint32_t parts[SomePacket::kMostParts];
     const size_t count = packet.part(parts);
     for (size_t i = 0; i < count; ++i) {

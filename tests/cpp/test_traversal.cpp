@@ -461,7 +461,7 @@ TEST(Traversal, RaysOfOnePacketMayStartApart) {
 TEST(Traversal, RaysOfOnePacketMayPart) {
     const Mesh mesh = make_sphere(24, 32);
     const Tree tree = build(mesh.soup(), {});
-    const Vec3f eye{0.01F, 0.02F, -0.03F};
+    const Vec3f eye{0x1p-6F, 0x1p-5F, -0x1p-5F};  // few digits, so that rays to it end in one point
     std::mt19937 random(6);
     std::uniform_real_distribution<float> uniform(-0.03F, 0.03F);
     for (uint32_t parts = 1; parts <= 8; ++parts) {
