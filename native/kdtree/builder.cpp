@@ -59,8 +59,9 @@ class Builder {
         Stopwatch total;
         Stopwatch watch;
         PhaseTimes& phases = tree_.report.phases_ms;
+        std::optional<TransientMemory> memory(std::in_place);
         std::optional<TopLevels> top;
-        std::optional<Subtrees> made(std::in_place, soup_, parameters_, cancel_, threads_);
+        std::optional<Subtrees> made(std::in_place, soup_, parameters_, cancel_, threads_, *memory);
         Subtrees& subtrees = *made;
         if (threads_ == 1) {
             make_references_alone(subtrees);
@@ -80,9 +81,10 @@ class Builder {
         phases.subtrees = watch.lap();
         subtrees.compact(top ? &*top : nullptr, tree_);
         phases.compaction = watch.lap();
-        build_layout(soup_, subtrees.boxes(), subtrees.triangles(), threads_, tree_);
+        build_layout(soup_, subtrees.boxes(), subtrees.triangles(), threads_, *memory, tree_);
         made.reset();  // giving memory back is part of what a build costs
         top.reset();
+        memory.reset();
         phases.layout = watch.lap();
         tree_.report.build_ms = total.lap();
         return std::move(tree_);

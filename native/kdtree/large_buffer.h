@@ -4,6 +4,7 @@
 #include <sys/mman.h>
 
 #include <algorithm>
+#include <atomic>
 #include <cstddef>
 #include <cstdint>
 #include <memory>
@@ -13,6 +14,8 @@
 #include <utility>
 
 namespace espalier {
+
+class TransientMemory;
 
 /// Room for `capacity` items straight from the operating system. Memory is taken only when it is first written, in huge
 /// pages where they pay: a fault costs several times what clearing its 4 KiB does. Items start as zero bytes.
@@ -106,14 +109,42 @@ class LargeBuffer {
  private:
     template <class U>
     friend class LargeBuffer;
+    friend class TransientMemory;
     static constexpr int kPopulateWrite = 23;          ///< MADV_POPULATE_WRITE, Linux 5.14
     static constexpr size_t kPage = size_t{64} << 10;  ///< the largest small page of any system
     /// From here on clearing the rest of a huge page costs no more than small pages do, and little memory is wasted.
     static constexpr size_t kHugePagesFrom = size_t{1536} << 10;
     T* data_ = nullptr;
     size_t capacity_ = 0;
-    void* mapping_ = nullptr;
+    void* mapping_ = nullptr;  ///< null also where the memory is another's
     size_t mapped_ = 0;
+};
+
+/// Memory for small buffers that are all given back together: whenever a piece is given back, all processors that use
+/// the process's memory have to be told, and wait.
+class TransientMemory {
+ public:
+    /// As LargeBuffer's constructor has it; must be destroyed before this. Any thread may call it.
+    template <class T>
+    LargeBuffer<T> take(size_t capacity, size_t expected_bytes = SIZE_MAX) {
+        constexpr size_t kLine = 64;
+        const size_t bytes = (capacity * sizeof(T) + kLine - 1) / kLine * kLine;
+        if (capacity < kBytes && std::min(bytes, expected_bytes) < LargeBuffer<T>::kHugePagesFrom) {
+            const size_t place = used_.fetch_add(bytes, std::memory_order_relaxed);
+            if (place + bytes <= kBytes) {
+                LargeBuffer<T> taken;
+                taken.data_ = reinterpret_cast<T*>(memory_.data() + place);
+                taken.capacity_ = capacity;
+                return taken;
+            }
+        }
+        return LargeBuffer<T>(capacity, expected_bytes);
+    }
+
+ private:
+    static constexpr size_t kBytes = size_t{64} << 20;  ///< of addresses, not of memory
+    LargeBuffer<std::byte> memory_{kBytes, 0};
+    std::atomic<size_t> used_{0};
 };
 
 }  // namespace espalier

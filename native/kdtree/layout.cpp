@@ -250,7 +250,7 @@ void collapse_whole(std::span<const KdNode> nodes, const TightBoxes& boxes, Wide
 }
 
 void build_layout(const TriangleSoup& soup, const TightBoxes& boxes, std::span<const uint32_t> triangles, int threads,
-                  Tree& tree) {
+                  TransientMemory& memory, Tree& tree) {
     constexpr size_t kBlocksPerTask = 512;
     const size_t blocks = triangles.size() / kBlockSize;
     const auto nodes = static_cast<uint32_t>(tree.nodes.size());
@@ -269,7 +269,7 @@ void build_layout(const TriangleSoup& soup, const TightBoxes& boxes, std::span<c
         if (i < runs.size()) {
             WideNodes& mine = made[static_cast<size_t>(worker)];
             if (mine.data() == nullptr) {
-                mine = WideNodes(most_wide_nodes, nodes / 8 / static_cast<size_t>(threads));
+                mine = WideNodes(most_wide_nodes, nodes / 8 / static_cast<size_t>(threads), memory);
             }
             const uint32_t first = mine.count();
             collapse.collapse(runs[i].begin, mine, nullptr);
@@ -285,7 +285,7 @@ void build_layout(const TriangleSoup& soup, const TightBoxes& boxes, std::span<c
     });
 
     // The wide nodes above the runs, whose number is small. A tree that is one run has none.
-    WideNodes top(most_wide_nodes, runs.size());
+    WideNodes top(most_wide_nodes, runs.size(), memory);
     const auto place_runs = [&](uint32_t first) {
         for (Run& run : runs) {
             run.place = first;

@@ -76,7 +76,7 @@ class Packet {
     }
 
     /// Traces the rays that have been set up.
-    HWY_INLINE void trace() {
+    HWY_NOINLINE void trace() {
         size_t stacked = 0;
         for (size_t pushed = stacked_;;) {
             for (const size_t end = stacked + pushed; stacked != end; ++stacked) {
@@ -188,7 +188,7 @@ class Packet {
         replace(t_max_, -1);
     }
 
-    HWY_INLINE bool set_up() {
+    HWY_NOINLINE bool set_up() {
         has_focus_ = false;
         const Vec3f first = origin_of(0);
         const Vec3f last = origin_of(kRays - 1);

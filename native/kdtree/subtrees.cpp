@@ -161,7 +161,7 @@ uint32_t Subtrees::give(const OpenNode& node, const References& references) {
 void Subtrees::build_one(Subtree& subtree, int worker) {
     SubtreeOutput& output = outputs_[static_cast<size_t>(worker)];
     if (output.nodes().data() == nullptr) {
-        output = SubtreeOutput(soup_.size() / static_cast<uint32_t>(threads_));
+        output = SubtreeOutput(soup_.size() / static_cast<uint32_t>(threads_), &memory_);
     }
     subtree.worker = worker;
     subtree.first_node = output.node_count();
@@ -204,7 +204,7 @@ void Subtrees::compact(TopLevels* top, Tree& tree) {
         return;
     }
     const size_t boxes = nodes + triangles / kBlockSize;
-    joined_ = LargeBuffer<Box3f>(boxes + triangles * sizeof(uint32_t) / sizeof(Box3f) + 1);
+    joined_ = memory_.take<Box3f>(boxes + triangles * sizeof(uint32_t) / sizeof(Box3f) + 1);
     joined_boxes_ = {joined_.data(), nodes};
     joined_part_boxes_ = {joined_.data() + nodes, triangles / kBlockSize};
     joined_triangles_ = {reinterpret_cast<uint32_t*>(joined_.data() + boxes), triangles};

@@ -16,8 +16,11 @@ namespace espalier {
 /// builds what decides where it lies until phase 4, never what the tree is.
 class Subtrees : public SubtreeSharing {
  public:
-    Subtrees(const TriangleSoup& soup, const BuildParameters& parameters, const std::atomic<bool>* cancel, int threads)
-        : soup_(soup),
+    /// memory: for what this needs itself; the references have their own.
+    Subtrees(const TriangleSoup& soup, const BuildParameters& parameters, const std::atomic<bool>* cancel, int threads,
+             TransientMemory& memory)
+        : memory_(memory),
+          soup_(soup),
           parameters_(parameters),
           cancel_(cancel),
           threads_(threads),
@@ -82,6 +85,7 @@ class Subtrees : public SubtreeSharing {
     void extend_boxes(const Tree& tree, size_t index, size_t last);
     size_t place_of(const Subtree& subtree, size_t node) const;
 
+    TransientMemory& memory_;
     const TriangleSoup& soup_;
     const BuildParameters& parameters_;
     const std::atomic<bool>* cancel_;

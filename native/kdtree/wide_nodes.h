@@ -18,6 +18,8 @@ class WideNodes {
  public:
     WideNodes() = default;
     WideNodes(size_t capacity, size_t expected) : nodes_(capacity, expected * sizeof(WideNode)) {}
+    WideNodes(size_t capacity, size_t expected, TransientMemory& memory)
+        : nodes_(memory.take<WideNode>(capacity, expected * sizeof(WideNode))) {}
     uint32_t add() { return count_++; }
     uint32_t count() const { return count_; }
     size_t capacity() const { return nodes_.size(); }
