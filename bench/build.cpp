@@ -50,9 +50,8 @@ Json quality_of(const Tree& tree) {
     const BuildReport& report = tree.report;
     char checksum[17];
     std::snprintf(checksum, sizeof checksum, "%016llx", static_cast<unsigned long long>(report.checksum));
-    const SahConstants model;
-    return {{"step", model.traversal},
-            {"block", model.block},
+    return {{"step", report.sah_constants.traversal},
+            {"block", report.sah_constants.block},
             {"sah_block", report.sah_cost},
             {"sah_classic", (kStep * sum.steps + kTriangle * sum.triangles) / area},
             {"nodes", report.nodes},

@@ -27,12 +27,11 @@ class Pinhole {
           right_(normalize(cross(forward_, view.up)) * view.slope),
           down_(cross(forward_, right_)) {}
 
-    Vec3f direction(int x, int y) const {
+    Ray ray(int x, int y) const {
         const float across = 2 * (static_cast<float>(x) + 0.5F) / kPicture - 1;
         const float along = 2 * (static_cast<float>(y) + 0.5F) / kPicture - 1;
-        return forward_ + down_ * along + right_ * across;
+        return {eye_, 0, forward_ + down_ * along + right_ * across, std::numeric_limits<float>::infinity()};
     }
-    Ray ray(int x, int y) const { return {eye_, 0, direction(x, y), std::numeric_limits<float>::infinity()}; }
 
  private:
     Vec3f eye_, forward_, right_, down_;

@@ -155,11 +155,12 @@ constexpr size_t kTilePixels = size_t{kTile} * kTile;
 class OurBatch {
  public:
     explicit OurBatch(const Tree& tree) : tree_(tree) {}
-    void set(size_t i, const Vec3f& origin, const Vec3f& direction, float t_max) {
-        rays_[i].origin = origin;
-        rays_[i].t_min = 0;
-        rays_[i].direction = direction;
-        rays_[i].t_max = t_max;
+    /// Member by member: copied as a whole, a ray that was just put together would be waited for.
+    void set(size_t i, const Ray& ray) {
+        rays_[i].origin = ray.origin;
+        rays_[i].t_min = ray.t_min;
+        rays_[i].direction = ray.direction;
+        rays_[i].t_max = ray.t_max;
     }
     void find_closest(size_t count) { intersect(tree_, std::span(rays_).first(count), std::span(hits_).first(count)); }
     void find_any(size_t count) { occluded(tree_, std::span(rays_).first(count), std::span(blocked_).first(count)); }
@@ -179,9 +180,7 @@ template <int kWidth>
 class EmbreeBatch {
  public:
     explicit EmbreeBatch(RTCScene scene) : scene_(scene) {}
-    void set(size_t i, const Vec3f& origin, const Vec3f& direction, float t_max) {
-        put(packets_[i / kWidth].ray, i % kWidth, {origin, 0, direction, t_max});
-    }
+    void set(size_t i, const Ray& ray) { put(packets_[i / kWidth].ray, i % kWidth, ray); }
     void find_closest(size_t count) {
         each_packet(count, [&](RTCIntersectContext& context, const int* valid, auto& packet) {
             std::fill_n(packet.hit.primID, kWidth, kNoFace);
@@ -237,9 +236,7 @@ void draw_tile(const Mesh& mesh, const Pinhole& camera, float offset, int x0, in
                std::vector<float>& picture) {
     std::array<float, kTilePixels> shade;
     std::array<size_t, kTilePixels> lit;
-    each_pixel(x0, y0, [&](size_t i, int x, int y) {
-        eye.set(i, mesh.view.eye, camera.direction(x, y), std::numeric_limits<float>::infinity());
-    });
+    each_pixel(x0, y0, [&](size_t i, int x, int y) { eye.set(i, camera.ray(x, y)); });
     eye.find_closest(kTilePixels);
     size_t count = 0;
     each_pixel(x0, y0, [&](size_t i, int x, int y) {
@@ -249,10 +246,10 @@ void draw_tile(const Mesh& mesh, const Pinhole& camera, float offset, int x0, in
             return;
         }
         const SurfacePoint point(mesh.soup(), eye.face(i), camera.ray(x, y), eye.t(i), offset);
-        const Vec3f to_light = mesh.view.light - point.position;
-        shade[count] = std::max(0.0F, dot(point.normal, to_light) / length(to_light));
+        const Ray ray = shadow_ray(point.position, mesh.view.light);
+        shade[count] = std::max(0.0F, dot(point.normal, ray.direction) / length(ray.direction));
         lit[count] = place;
-        light.set(count++, point.position, to_light, 1);
+        light.set(count++, ray);
     });
     light.find_any(count);
     for (size_t i = 0; i < count; ++i) {

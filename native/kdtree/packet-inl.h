@@ -157,14 +157,11 @@ class Packet {
         const Way way(direction_of(leader));
         uint32_t found = 0;
         for (size_t lane = 0; lane < kRays; lane += kLanes) {
-            V off[2];
-            for (size_t i = 0; i < 2; ++i) {
-                const size_t axis = i == 0 ? way.axes.x : way.axes.y;
-                const V slope =
-                    hn::Div(hn::Load(d, direction_[axis] + lane), hn::Load(d, direction_[way.axes.z] + lane));
-                off[i] = hn::Abs(hn::Sub(slope, hn::Set(d, direction_[axis][leader] / direction_[way.axes.z][leader])));
-            }
-            const auto is_near = hn::Le(hn::Max(off[0], off[1]), hn::Set(d, kWidest / 2));
+            const auto off = [&](int axis) {
+                const V slope = hn::Div(hn::Load(d, direction_[axis] + lane), hn::Load(d, direction_[way.z] + lane));
+                return hn::Abs(hn::Sub(slope, hn::Set(d, way.towards[axis] / way.towards[way.z])));
+            };
+            const auto is_near = hn::Le(hn::Max(off(way.x), off(way.y)), hn::Set(d, kWidest / 2));
             found |= mask_bits(d, hn::And(is_near, runs(way, lane))) << lane;
         }
         return found;
@@ -251,16 +248,15 @@ class Packet {
 
     /// A direction, by its signs and by which of its components is the largest.
     struct Way {
-        Axes axes;
         Vec3f towards;
         int x, y, z;
 
-        HWY_INLINE explicit Way(Vec3f direction)
-            : axes(direction),
-              towards(direction),
-              x(static_cast<int>(axes.x)),
-              y(static_cast<int>(axes.y)),
-              z(static_cast<int>(axes.z)) {}
+        HWY_INLINE explicit Way(Vec3f direction) : towards(direction) {
+            const Axes axes(direction);
+            x = static_cast<int>(axes.x);
+            y = static_cast<int>(axes.y);
+            z = static_cast<int>(axes.z);
+        }
     };
 
     /// Which of the rays from `lane` on run that way, and are rays: what is none would take hits from those beside it.
@@ -272,7 +268,7 @@ class Packet {
             return way.towards[axis] < 0 ? hn::Ge(along[axis], zero) : hn::Lt(along[axis], zero);
         };
         const auto any_turns = hn::Or(turns(0), hn::Or(turns(1), turns(2)));
-        const V size = hn::Abs(hn::Load(d, direction_[way.axes.z] + lane));
+        const V size = hn::Abs(hn::Load(d, direction_[way.z] + lane));
         const auto is_steep = hn::And(hn::Ge(size, largest_of(along)), hn::Gt(size, zero));
         // Not equal to itself where the direction has an infinite component or a NaN, or t is NaN.
         const V all = hn::MulAdd(hn::Add(along[0], hn::Add(along[1], along[2])), zero,
@@ -429,9 +425,9 @@ class Packet {
         if (focus_.spread_x > kWidest || focus_.spread_y > kWidest) {
             return false;
         }
-        focus_.x = way.axes.x * kBlockSize;
-        focus_.y = way.axes.y * kBlockSize;
-        focus_.z = way.axes.z * kBlockSize;
+        focus_.x = static_cast<uint32_t>(way.x) * kBlockSize;
+        focus_.y = static_cast<uint32_t>(way.y) * kBlockSize;
+        focus_.z = static_cast<uint32_t>(way.z) * kBlockSize;
         focus_.at_x = focus[way.x];
         focus_.at_y = focus[way.y];
         focus_.at_z = focus[way.z];

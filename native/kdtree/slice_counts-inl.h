@@ -47,30 +47,37 @@ constexpr std::array<uint8_t, 64> make_transposition() {
     return from;
 }
 
-/// For each slice a byte of bits: of planes 0 to 7 or 8 to 15, those that lie behind it.
-HWY_INLINE __m512i planes_behind(__m512i slices, size_t half) {
+/// Per eight bytes the identity, as an 8x8 matrix of bits.
+HWY_INLINE __m512i identity_matrices() { return _mm512_set1_epi64(static_cast<int64_t>(0x8040201008040201U)); }
+
+/// For eight slices each, and planes 0 to 7 or 8 to 15, a byte per plane: which of the slices lie before it, in
+/// reverse. Looked up by slice it is bits of planes behind; eight such bytes are an 8x8 matrix, which is transposed.
+HWY_INLINE __m512i slices_before_planes(__m512i slices, size_t half) {
     alignas(64) static constexpr auto kPlanesBehind = make_planes_behind();
-    return _mm512_shuffle_epi8(_mm512_load_si512(kPlanesBehind[half].data()), slices);
+    const __m512i by_slice = _mm512_shuffle_epi8(_mm512_load_si512(kPlanesBehind[half].data()), slices);
+    return _mm512_gf2p8affine_epi64_epi8(identity_matrices(), by_slice, 0);
 }
 
-/// Counts for each plane the slices before it, which a table holds as bits. Eight such bytes are an 8x8 matrix, and
-/// where that is transposed the population counts of its bytes are the counts of eight planes.
+/// Puts the bytes of each plane side by side.
+HWY_INLINE __m512i gather_planes(__m512i bytes) {
+    alignas(64) static constexpr auto kTransposition = make_transposition();
+    return _mm512_permutexvar_epi8(_mm512_load_si512(kTransposition.data()), bytes);
+}
+
+/// Counts for each plane the slices before it: population counts of bytes.
 class SliceCounter {
  public:
     HWY_INLINE SliceCounter() { bytes_[0] = bytes_[1] = totals_[0] = totals_[1] = _mm512_setzero_si512(); }
     HWY_INLINE void add(hn::Vec<hn::Full512<int8_t>> slices) {
-        const __m512i identity = _mm512_set1_epi64(static_cast<int64_t>(0x8040201008040201U));
         for (size_t half = 0; half < 2; ++half) {
-            const __m512i by_plane = _mm512_gf2p8affine_epi64_epi8(identity, planes_behind(slices.raw, half), 0);
-            bytes_[half] = _mm512_add_epi8(bytes_[half], _mm512_popcnt_epi8(by_plane));
+            bytes_[half] = _mm512_add_epi8(bytes_[half], _mm512_popcnt_epi8(slices_before_planes(slices.raw, half)));
         }
     }
     /// Adds the bytes' counts to the totals: at the latest after kMostVectors.
     HWY_INLINE void empty_bytes() {
-        alignas(64) static constexpr auto kTransposition = make_transposition();
         for (size_t half = 0; half < 2; ++half) {
-            const __m512i by_plane = _mm512_permutexvar_epi8(_mm512_load_si512(kTransposition.data()), bytes_[half]);
-            totals_[half] = _mm512_add_epi64(totals_[half], _mm512_sad_epu8(by_plane, _mm512_setzero_si512()));
+            const __m512i sums = _mm512_sad_epu8(gather_planes(bytes_[half]), _mm512_setzero_si512());
+            totals_[half] = _mm512_add_epi64(totals_[half], sums);
             bytes_[half] = _mm512_setzero_si512();
         }
     }

@@ -27,13 +27,8 @@ namespace hn = hwy::HWY_NAMESPACE;
 #if HWY_TARGET == HWY_AVX3_DL
 /// Per plane, of 64 slices, those before it: the bits of planes 0 to 7 or 8 to 15.
 HWY_INLINE __m512i slices_before(__m512i slices, size_t half) {
-    alignas(64) static constexpr auto kTransposition = make_transposition();
-    const __m512i by_slice = planes_behind(slices, half);
-    // An 8x8 transposition leaves each byte's bits in reverse.
-    const __m512i identity = _mm512_set1_epi64(static_cast<int64_t>(0x8040201008040201U));
-    const __m512i by_plane =
-        _mm512_gf2p8affine_epi64_epi8(_mm512_gf2p8affine_epi64_epi8(identity, by_slice, 0), identity, 0);
-    return _mm512_permutexvar_epi8(_mm512_load_si512(kTransposition.data()), by_plane);
+    const __m512i reversed = slices_before_planes(slices, half);
+    return gather_planes(_mm512_gf2p8affine_epi64_epi8(reversed, identity_matrices(), 0));
 }
 
 /// For up to 64 references, two rows of masks: of the first 32, and of the others.

@@ -14,18 +14,19 @@ namespace {
 /// Buffers of one memory, taken by all threads, too many and too large for it: each keeps what was written to it.
 TEST(TransientMemory, GivesEachBufferRoomOfItsOwn) {
     constexpr size_t kBuffers = 200;
+    const auto size_of = [](size_t i) { return i % 50 == 7 ? size_t{1} << 20 : 150'000 + 7 * i; };
     TransientMemory memory;
     std::vector<LargeBuffer<uint32_t>> buffers(kBuffers);
     std::atomic<size_t> not_zero{0};
     parallel_for(4, kBuffers, [&](size_t i) {
-        buffers[i] = memory.take<uint32_t>(i % 50 == 7 ? size_t{1} << 20 : 150'000 + 7 * i);
+        buffers[i] = memory.take<uint32_t>(size_of(i));
         not_zero += static_cast<size_t>(
             std::count_if(buffers[i].span().begin(), buffers[i].span().end(), [](uint32_t item) { return item != 0; }));
         std::fill_n(buffers[i].data(), buffers[i].size(), static_cast<uint32_t>(i + 1));
     });
     EXPECT_EQ(not_zero, 0U);
     for (size_t i = 0; i < kBuffers; ++i) {
-        EXPECT_EQ(buffers[i].size(), i % 50 == 7 ? size_t{1} << 20 : 150'000 + 7 * i);
+        EXPECT_EQ(buffers[i].size(), size_of(i));
         EXPECT_EQ(static_cast<size_t>(
                       std::count(buffers[i].span().begin(), buffers[i].span().end(), static_cast<uint32_t>(i + 1))),
                   buffers[i].size());
