@@ -44,10 +44,14 @@ class Packet {
 
     /// Sets the rays up if they make a packet.
     HWY_INLINE bool gather(const Ray* rays) {
-        unpack(rays);
         for (size_t lane = 0; lane < kRays; lane += 64 / sizeof(Ray)) {
             __builtin_prefetch(rays + kRays + lane);  // the next packet's
         }
+        has_focus_ = false;
+        if (!meet(rays[0], rays[kRays - 1])) {
+            return false;
+        }
+        unpack(rays);
         return set_up();
     }
 
@@ -185,8 +189,19 @@ class Packet {
         replace(t_max_, -1);
     }
 
+    /// Whether two rays start in one point or, for any hit, end in one up to rounding, as all of a packet do.
+    static HWY_INLINE bool meet(const Ray& a, const Ray& b) {
+        return a.origin == b.origin || (kAnyHit && end_together(a.origin + a.direction, b.origin + b.direction));
+    }
+
+    /// Seen from farther away than any triangle may lie, products would overflow.
+    static HWY_INLINE bool end_together(Vec3f end, Vec3f other) {
+        const Vec3f off = other - end;
+        const float size = std::abs(end.x) + std::abs(end.y) + std::abs(end.z);
+        return size <= kMaxCoordinate && std::abs(off.x) + std::abs(off.y) + std::abs(off.z) <= size * 0x1p-20F;
+    }
+
     HWY_NOINLINE bool set_up() {
-        has_focus_ = false;
         const Vec3f first = origin_of(0);
         const Vec3f last = origin_of(kRays - 1);
         if (first == last && all_start_at(first)) {
@@ -195,10 +210,7 @@ class Packet {
         }
         if constexpr (kAnyHit) {
             const Vec3f end = first + direction_of(0);
-            const Vec3f off = last + direction_of(kRays - 1) - end;
-            const float size = std::abs(end.x) + std::abs(end.y) + std::abs(end.z);
-            // Seen from farther away than any triangle may lie, products would overflow.
-            if (size <= kMaxCoordinate && std::abs(off.x) + std::abs(off.y) + std::abs(off.z) <= size * 0x1p-20F) {
+            if (end_together(end, last + direction_of(kRays - 1))) {
                 return to_focus(end);
             }
         }

@@ -18,6 +18,7 @@
 #include "kdtree/size_class.h"
 #include "kdtree/traced_ray-inl.h"
 #include "kdtree/traversal.h"
+#include "kdtree/triangle_test-inl.h"
 
 HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
@@ -147,14 +148,16 @@ class RayBatch {
         for (size_t first = 0; first < kSize; first += kLanes) {
             lean = hn::Max(lean, set_up_lanes(first, rays + first));
         }
-        if (const float most = hn::GetLane(hn::MaxOfLanes(D(), lean)); most > lean_) {
-            lean_ = most;
-            set_least_inside();
+        if constexpr (kAsksFirst) {
+            if (const float most = hn::GetLane(hn::MaxOfLanes(D(), lean)); most > lean_) {
+                lean_ = most;
+                set_least_inside();
+            }
         }
     }
 
-    /// By size class of a block: no edge function of a triangle that a ray hits is less inside, of any ray since the
-    /// last reset.
+    /// Where steps ask first, by size class of a block: no edge function of a triangle that a ray hits is less inside,
+    /// of any ray since the last reset.
     const float* least_inside() const { return least_inside_; }
     void reset() { lean_ = -1; }
 

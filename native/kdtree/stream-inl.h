@@ -142,7 +142,10 @@ class Stream {
                 visit_node(ray, nodes_[ray.next]);
                 go_on(ray, *--ray.top, lists);
             }
+            // Whether a ray meets something in a leaf cannot be foreseen: those that may are listed, and looked at
+            // together.
             const uint32_t leaves = std::exchange(lists.at_leaf, 0);
+            uint32_t meeting = 0;
             for (uint32_t i = 0; i < leaves; ++i) {
                 StreamRay& ray = *leaf_list_[i];
                 const uint32_t leaf = ray.next;
@@ -151,11 +154,20 @@ class Stream {
                     continue;
                 }
                 const uint32_t further = leaf % WideNode::kMaxLeafBlocks;  // blocks behind the first
-                const uint32_t block = WideNode::first_block(leaf);
-                Verdict verdict;
-                const uint32_t possible =
-                    test_blocks<kExact>(ray, blocks_ + block, at_most_one(further), batch_.least_inside(), verdict);
-                if (possible != 0 && take(ray, verdict, possible, block)) {
+                Meeting& met = meetings_[meeting];
+                const uint32_t possible = test_blocks<kExact>(ray, blocks_ + WideNode::first_block(leaf),
+                                                              at_most_one(further), batch_.least_inside(), met.verdict);
+                met.ray = &ray;
+                met.leaf = leaf;
+                met.possible = possible;
+                const uint32_t meets = at_most_one(possible);
+                meeting += meets;
+                leave(ray, leaf, lists, 1 - meets);
+            }
+            for (uint32_t i = 0; i < meeting; ++i) {
+                const Meeting& met = meetings_[i];
+                StreamRay& ray = *met.ray;
+                if (take(ray, met)) {
                     if constexpr (kAnyHit) {
                         end_list_[lists.at_end++] = &ray;
                         continue;
@@ -163,13 +175,7 @@ class Stream {
                         ray.prune();
                     }
                 }
-                // The rest of the leaf is some blocks further, and as many less. Where there is none, what lies on top
-                // is next, again chosen without a branch: how long leaves are cannot be foreseen.
-                const uint32_t is_last = (further - kBlocksPerStep) >> 31;
-                const uint32_t rest = leaf + (WideNode::kMaxLeafBlocks - 1) * kBlocksPerStep;
-                const uint32_t top = ray.top[-1];
-                ray.top -= is_last;
-                go_on(ray, rest ^ ((rest ^ top) & (0U - is_last)), lists);
+                leave(ray, met.leaf, lists);
             }
             const uint32_t ended = std::exchange(lists.at_end, 0);
             for (uint32_t i = 0; i < ended; ++i) {
@@ -190,10 +196,16 @@ class Stream {
         uint32_t at_end = 0;
     };
 
-    /// 0 for 0, 1 for all other numbers of blocks.
-    static HWY_INLINE uint32_t at_most_one(uint32_t blocks) {
-        return (blocks + WideNode::kMaxLeafBlocks - 1) / WideNode::kMaxLeafBlocks;
-    }
+    /// A ray and what its step at a leaf has found.
+    struct Meeting {
+        Verdict verdict;
+        StreamRay* ray;
+        uint32_t leaf;
+        uint32_t possible;
+    };
+
+    /// 0 for 0, 1 for all other numbers below 2^31, without a branch.
+    static HWY_INLINE uint32_t at_most_one(uint32_t number) { return (0U - number) >> 31; }
 
     /// Puts the next ray, if there is one, in place of one that has ended.
     HWY_INLINE void begin(StreamRay& ray, Lists& lists) {
@@ -225,8 +237,21 @@ class Stream {
         return true;
     }
 
-    /// Puts a ray on the list of what it does next, and has the memory for that fetched, without a branch on which.
-    HWY_INLINE void go_on(StreamRay& ray, uint32_t child, Lists& lists) {
+    /// Goes on after a step at a leaf, if `counts` is 1.
+    HWY_INLINE void leave(StreamRay& ray, uint32_t leaf, Lists& lists, uint32_t counts = 1) {
+        // The rest of the leaf is some blocks further, and as many less. Where there is none, what lies on top is next,
+        // chosen without a branch: how long leaves are cannot be foreseen.
+        const uint32_t further = leaf % WideNode::kMaxLeafBlocks;
+        const uint32_t is_last = (further - kBlocksPerStep) >> 31;
+        const uint32_t rest = leaf + (WideNode::kMaxLeafBlocks - 1) * kBlocksPerStep;
+        const uint32_t top = ray.top[-1];
+        ray.top -= is_last & counts;
+        go_on(ray, rest ^ ((rest ^ top) & (0U - is_last)), lists, counts);
+    }
+
+    /// Puts a ray on the list of what it does next, if `counts` is 1, and has the memory for that fetched, without a
+    /// branch on which.
+    HWY_INLINE void go_on(StreamRay& ray, uint32_t child, Lists& lists, uint32_t counts = 1) {
         ray.next = child;
         static_assert(StreamRay::kNothing == 0);
         const uint32_t is_leaf = child >> 31;
@@ -234,9 +259,9 @@ class Stream {
         leaf_list_[lists.at_leaf] = &ray;
         node_list_[lists.at_node] = &ray;
         end_list_[lists.at_end] = &ray;
-        lists.at_leaf += is_leaf;
-        lists.at_node += 1 - is_leaf - is_end;
-        lists.at_end += is_end;
+        lists.at_leaf += is_leaf & counts;
+        lists.at_node += (1 - is_leaf - is_end) & counts;
+        lists.at_end += is_end & counts;
         const auto node = reinterpret_cast<uintptr_t>(nodes_ + child);
         const auto block = reinterpret_cast<uintptr_t>(blocks_ + WideNode::first_block(child));
         // A choice that compilers would make with a branch.
@@ -247,11 +272,13 @@ class Stream {
         }
     }
 
-    /// Takes in what a block's test has found. Returns whether there is a new nearest hit.
-    HWY_INLINE bool take(StreamRay& ray, const Verdict& verdict, uint32_t possible, uint32_t block) {
+    /// Takes in what a step at a leaf has found. Returns whether there is a new nearest hit.
+    HWY_INLINE bool take(StreamRay& ray, const Meeting& met) {
+        const Verdict& verdict = met.verdict;
+        const uint32_t block = WideNode::first_block(met.leaf);
         bool taken = false;
         uint32_t open = 0;
-        for (uint32_t lanes = possible; lanes != 0; lanes &= lanes - 1) {
+        for (uint32_t lanes = met.possible; lanes != 0; lanes &= lanes - 1) {
             const auto lane = static_cast<uint32_t>(std::countr_zero(lanes));
             const float lower = verdict.lower[lane];
             const float upper = verdict.upper[lane];
@@ -308,6 +335,7 @@ class Stream {
     StreamRay* node_list_[kInFlight + 1];
     StreamRay* leaf_list_[kInFlight + 1];
     StreamRay* end_list_[kInFlight + 1];
+    Meeting meetings_[kInFlight];
     StreamRay ray_[kInFlight];
 };
 

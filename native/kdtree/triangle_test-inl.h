@@ -12,7 +12,6 @@
 
 #include <hwy/highway.h>
 
-#include <algorithm>
 #include <cstdint>
 
 #include "kdtree/candidate.h"
@@ -25,6 +24,10 @@ namespace hn = hwy::HWY_NAMESPACE;
 
 /// Blocks that one step tests: as many as fill a register.
 constexpr uint32_t kBlocksPerStep = hn::MaxLanes(hn::CappedTag<float, 2 * kBlockSize>()) == 2 * kBlockSize ? 2 : 1;
+
+/// Whether a step asks first if the ray may meet any of the triangles at all. Of two blocks it does about half of the
+/// time, and to guess that wrong costs more than the rest of the test.
+constexpr bool kAsksFirst = kBlocksPerStep == 1;
 
 /// What the float test says of the lanes it does not rule out. Lanes of a second block follow those of the first.
 struct Verdict {
@@ -54,15 +57,6 @@ class BlockLoader {
     const float* first_;
     [[maybe_unused]] const float* second_;
 };
-
-/// That of the larger of the blocks that a step tests.
-HWY_INLINE uint32_t size_class(const TriangleBlock* block, uint32_t second) {
-    uint32_t triangle = block->triangle[0];
-    if constexpr (kBlocksPerStep == 2) {
-        triangle = std::min(triangle, block[second].triangle[0]);
-    }
-    return triangle / kMaxTriangles;
-}
 
 /// One ray for all lanes, or one for each.
 template <class V>
@@ -169,7 +163,7 @@ HWY_INLINE DepthRange<V> depth_range(const V (&side)[3], V bound, V mz, V z0, V 
 /// counts by at most 2^-149 s, which u s^2 outweighs from s = 2^-125 on.
 template <bool kExact>
 HWY_INLINE uint32_t test_blocks(const TracedRay& ray, const TriangleBlock* block, uint32_t second,
-                                const float* least_inside_of_class, Verdict& verdict) {
+                                [[maybe_unused]] const float* least_inside_of_class, Verdict& verdict) {
     const hn::CappedTag<float, kBlocksPerStep * kBlockSize> d;
     constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<float, kBlocksPerStep * kBlockSize>());
     using V = hn::Vec<decltype(d)>;
@@ -183,16 +177,20 @@ HWY_INLINE uint32_t test_blocks(const TracedRay& ray, const TriangleBlock* block
                                 hn::Set(d, ray.sx),
                                 hn::Set(d, ray.sy),
                                 hn::Set(d, ray.slant)};
-    const V least_inside = kExact ? hn::Set(d, least_inside_of_class[size_class(block, second)]) : hn::Zero(d);
     uint32_t possible = 0;
+    uint32_t certain = 0;
     for (size_t first = 0; first < kBlockSize; first += kLanes) {
         const Sheared<V> seen(sheared,
                               [&](size_t k, uint32_t axis) { return load(k * 3 * kBlockSize + first + axis); });
         const V inwards = depth_inside(seen.side);  // lanes without a triangle are NaN and fail
-        if (hn::AllFalse(d, hn::Ge(inwards, least_inside))) {
-            continue;
+        if constexpr (kAsksFirst) {
+            const uint32_t size_class = block->triangle[0] / kMaxTriangles;
+            const V least = kExact ? hn::Set(d, least_inside_of_class[size_class]) : hn::Zero(d);
+            if (hn::AllFalse(d, hn::Ge(inwards, least))) {
+                continue;
+            }
         }
-        V below = least_inside;
+        V below = hn::Zero(d);
         V mz = below;
         if constexpr (kExact) {
             mz = largest_of(seen.z);
@@ -203,20 +201,15 @@ HWY_INLINE uint32_t test_blocks(const TracedRay& ray, const TriangleBlock* block
         const V(&z)[3] = seen.z;
         const DepthRange<V> depth =
             depth_range<kExact>(seen.side, bound, mz, z[0], hn::Sub(z[1], z[0]), hn::Sub(z[2], z[0]), ray.sign);
-        const auto certain = kExact ? hn::And(depth.is_sound, hn::Gt(inwards, bound)) : inside;
+        const auto is_certain = kExact ? hn::And(depth.is_sound, hn::Gt(inwards, bound)) : inside;
         const auto counts = hn::And(
             inside, hn::And(hn::Le(depth.lower, hn::Set(d, ray.reach)), hn::Ge(depth.upper, hn::Set(d, ray.start))));
-        if (hn::AllFalse(d, counts)) {
-            continue;
-        }
-        if (possible == 0) {
-            verdict.certain = 0;
-        }
         hn::Store(depth.lower, d, verdict.lower + first);
         hn::Store(depth.upper, d, verdict.upper + first);
         possible |= mask_bits(d, counts) << first;
-        verdict.certain |= mask_bits(d, certain) << first;
+        certain |= mask_bits(d, is_certain) << first;
     }
+    verdict.certain = certain;
     return second == 0 ? possible & ((1U << kBlockSize) - 1) : possible;
 }
 
