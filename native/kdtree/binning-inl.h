@@ -11,6 +11,9 @@
 
 #include <hwy/highway.h>
 
+#include <algorithm>
+#include <utility>
+
 #include "kdtree/build_kernels.h"
 #include "kdtree/sah-inl.h"
 #include "kdtree/slice_counts-inl.h"
@@ -55,6 +58,25 @@ HWY_INLINE hn::Mask<D> is_affordable(D d, const OpenNode& node, hn::Vec<DU> left
     return hn::RebindMask(d, hn::Lt(hn::BitCast(di, hn::Add(left, right)), too_many));
 }
 
+/// What a sample's counts at planes within the tight box stand for. On both sides of each lies something: what the box
+/// is tight around.
+inline void scale_up(BinCounts& counts, const OpenNode& node) {
+    if (counts.sampled == 0) {
+        return;
+    }
+    const float ratio = static_cast<float>(node.count) / static_cast<float>(std::exchange(counts.sampled, 0));
+    const auto scale = [&](uint32_t count, uint32_t least, uint32_t most) {
+        const float scaled = std::min(static_cast<float>(count) * ratio, static_cast<float>(most));
+        return std::clamp(static_cast<uint32_t>(scaled), least, most);
+    };
+    for (int axis = 0; axis < 3; ++axis) {
+        for (int plane = 1; plane < kSlices; ++plane) {
+            counts.left[axis][plane] = scale(counts.left[axis][plane], 1, node.count);
+            counts.ends_before[axis][plane] = scale(counts.ends_before[axis][plane], 0, node.count - 1);
+        }
+    }
+}
+
 /// The costs of the planes from `first` on that cut [lower, upper] into slices.
 template <class D>
 HWY_INLINE hn::Vec<D> slice_costs(D d, const SplitCosts<D>& costs, const OpenNode& node, int axis, float lower,
@@ -72,6 +94,7 @@ inline Split choose_split(const OpenNode& node, BinCounts& counts, const BuildPa
     if (!may_be_split(node, parameters)) {
         return {};
     }
+    scale_up(counts, node);
     const CellShape shape(node.cell);
     const SplitCosts costs(d, node, shape, parameters.sah);
     CheapestPlane cheapest(d);
@@ -95,9 +118,10 @@ inline Split choose_split(const OpenNode& node, BinCounts& counts, const BuildPa
     return {axis, hn::GetLane(position), cheapest.cost()};
 }
 
-inline Split choose_finer_split(const OpenNode& node, Split split, Interval range, const BinCounts& counts,
+inline Split choose_finer_split(const OpenNode& node, Split split, Interval range, BinCounts& counts,
                                 const BuildParameters& parameters) {
     const hn::CappedTag<float, 16> d;
+    scale_up(counts, node);
     const CellShape shape(node.cell);
     const SplitCosts costs(d, node, shape, parameters.sah);
     CheapestPlane cheapest(d);

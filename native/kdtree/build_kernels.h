@@ -47,11 +47,22 @@ struct OpenNode {
     int depth;
 };
 
+/// Nodes of so many references, more than a processor's own cache holds, are judged by a sample: to read all of them
+/// takes longer than anything else but to partition them.
+constexpr uint32_t kSampledFrom = 1U << 17;
+
+/// Whether the counts of a node are those of a sample. Only where each of its references may be split, so that the
+/// bound on their number does not depend on a sample.
+inline bool is_sampled(const OpenNode& node, const BuildParameters& parameters) {
+    return node.count >= kSampledFrom && node.spare >= node.count && parameters.search == Search::kFinerSlices;
+}
+
 /// References that begin before plane j, and that end before it, per axis, for the planes between slices. Counts add up
 /// over parts of a node. There is room for both ends of the node's tight box.
 struct BinCounts {
     alignas(64) uint32_t left[3][kPlanes];
     alignas(64) uint32_t ends_before[3][kPlanes];
+    uint32_t sampled;  ///< how many were counted, if not all
 };
 
 struct Interval {
@@ -102,16 +113,17 @@ struct BuildKernels {
     /// others.
     uint32_t (*make_references)(const TriangleSoup& soup, uint32_t begin, uint32_t end, const References& out,
                                 Box3f& bounds, RejectedFaces& rejected);
-    /// Adds part of a node's references to its counts.
-    void (*count_bins)(const References& references, uint32_t count, const Box3f& tight, BinCounts& counts);
+    /// Adds part of a node's references, or a sample of them, to its counts.
+    void (*count_bins)(const OpenNode& node, const References& references, uint32_t count,
+                       const BuildParameters& parameters, BinCounts& counts);
     /// The same for one axis and the planes that cut an interval of it.
-    void (*count_bins_along)(int axis, const References& references, uint32_t count, float lower, float upper,
-                             BinCounts& counts);
+    void (*count_bins_along)(const OpenNode& node, int axis, Interval range, const References& references,
+                             uint32_t count, const BuildParameters& parameters, BinCounts& counts);
     /// The plane of least cost by the surface area heuristic, or a leaf. Fills in the counts at the ends of the tight
     /// box.
     Split (*choose_split)(const OpenNode& node, BinCounts& counts, const BuildParameters& parameters);
     /// The cheapest of a split and the planes that cut an interval around it.
-    Split (*choose_finer_split)(const OpenNode& node, Split split, Interval range, const BinCounts& counts,
+    Split (*choose_finer_split)(const OpenNode& node, Split split, Interval range, BinCounts& counts,
                                 const BuildParameters& parameters);
     /// The plane that a node is split at, or a leaf: all of the above on one thread, as far as the parameters ask.
     Split (*find_split)(const OpenNode& node, const References& references, const BuildParameters& parameters);

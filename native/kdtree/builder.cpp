@@ -72,8 +72,8 @@ class Builder {
             phases.bounds = watch.lap();
             tree_.report.rejected_faces = top->rejected();
             tree_.bounds = top->nodes()[0].node.cell;
-            // From then on one node for each thread will do. In large scenes subtrees stay small enough for the cache.
-            top->split_above(std::min(soup_.size() / static_cast<uint32_t>(threads_), uint32_t{1} << 17));
+            // From then on one node for each thread will do: what one thread splits depth first stays in its cache.
+            top->split_above(soup_.size() / static_cast<uint32_t>(threads_));
             subtrees.add_below(*top);
             phases.top_levels = watch.lap();
         }

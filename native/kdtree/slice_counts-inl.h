@@ -13,8 +13,10 @@
 
 #include <algorithm>
 #include <array>
+#include <bit>
 
 #include "kdtree/build_kernels.h"
+#include "kdtree/compress-inl.h"
 #include "kdtree/slices-inl.h"
 
 #if HWY_TARGET == HWY_AVX3_DL
@@ -163,18 +165,82 @@ inline void count_slices(int axis, const float* lower, const float* upper, uint3
 }
 #endif
 
-inline void count_bins_along(int axis, const References& references, uint32_t count, float lower, float upper,
-                             BinCounts& counts) {
-    if (Slices::can_be_cut(lower, upper)) {
-        const auto a = static_cast<size_t>(axis);
-        count_slices(axis, references.lower[a], references.upper[a], count, Slices(lower, upper), counts);
+/// Calls use(references, count) for an eighth of the references, some at a time, of which the axes [begin, end) are
+/// filled in. Which they are depends on their triangles alone, neighbours in the mesh together, whose boxes lie on one
+/// line of the cache as a rule; scattered, since meshes are regular.
+template <class F>
+inline void sample(const References& references, uint32_t count, size_t begin, size_t end, const F& use) {
+    const hn::ScalableTag<float> d;
+    const hn::RebindToUnsigned<decltype(d)> du;
+    constexpr uint32_t kLanes = hn::MaxLanes(hn::ScalableTag<float>());
+    constexpr uint32_t kCapacity = 1024;
+    alignas(64) float bounds[2][3][kCapacity];
+    References taken;
+    for (size_t axis = 0; axis < 3; ++axis) {
+        taken.lower[axis] = bounds[0][axis];
+        taken.upper[axis] = bounds[1][axis];
+    }
+    uint32_t kept = 0;
+    for (uint32_t i = 0; i < count; i += kLanes) {
+        const auto group = hn::ShiftRight<5>(hn::LoadU(du, references.triangle + i));
+        const auto scattered = hn::Mul(group, hn::Set(du, 0x9e3779b1U));
+        const auto is_taken =
+            hn::And(hn::RebindMask(d, hn::Eq(hn::ShiftRight<29>(scattered), hn::Zero(du))), hn::FirstN(d, count - i));
+        if (hn::AllFalse(d, is_taken)) {
+            continue;
+        }
+        const Compression compression(d, is_taken);
+        for (size_t axis = begin; axis < end; ++axis) {
+            compression.store(d, hn::LoadU(d, references.lower[axis] + i), taken.lower[axis] + kept);
+            compression.store(d, hn::LoadU(d, references.upper[axis] + i), taken.upper[axis] + kept);
+        }
+        kept += static_cast<uint32_t>(std::popcount(compression.bits()));
+        if (kept > kCapacity - kLanes) {
+            use(taken, kept);
+            kept = 0;
+        }
+    }
+    if (kept != 0) {
+        use(taken, kept);
     }
 }
 
-inline void count_bins(const References& references, uint32_t count, const Box3f& range, BinCounts& counts) {
-    for (int axis = 0; axis < 3; ++axis) {
-        count_bins_along(axis, references, count, range.lower[axis], range.upper[axis], counts);
+inline void count_bins_along(int axis, Interval range, const References& references, uint32_t count,
+                             BinCounts& counts) {
+    if (Slices::can_be_cut(range.lower, range.upper)) {
+        const auto a = static_cast<size_t>(axis);
+        count_slices(axis, references.lower[a], references.upper[a], count, Slices(range.lower, range.upper), counts);
     }
+}
+
+inline void count_bins_along(const OpenNode& node, int axis, Interval range, const References& references,
+                             uint32_t count, const BuildParameters& parameters, BinCounts& counts) {
+    if (!is_sampled(node, parameters)) {
+        count_bins_along(axis, range, references, count, counts);
+        return;
+    }
+    const auto a = static_cast<size_t>(axis);
+    sample(references, count, a, a + 1, [&](const References& taken, uint32_t number) {
+        count_bins_along(axis, range, taken, number, counts);
+        counts.sampled += number;
+    });
+}
+
+inline void count_bins(const OpenNode& node, const References& references, uint32_t count,
+                       const BuildParameters& parameters, BinCounts& counts) {
+    const auto count_all = [&](const References& some, uint32_t number) {
+        for (int axis = 0; axis < 3; ++axis) {
+            count_bins_along(axis, {node.tight.lower[axis], node.tight.upper[axis]}, some, number, counts);
+        }
+    };
+    if (!is_sampled(node, parameters)) {
+        count_all(references, count);
+        return;
+    }
+    sample(references, count, 0, 3, [&](const References& taken, uint32_t number) {
+        count_all(taken, number);
+        counts.sampled += number;
+    });
 }
 
 }  // namespace espalier::HWY_NAMESPACE

@@ -27,6 +27,7 @@ void add(const BinCounts& part, BinCounts& sum) {
             sum.ends_before[axis][j] += part.ends_before[axis][j];
         }
     }
+    sum.sampled += part.sampled;
 }
 
 }  // namespace
@@ -115,7 +116,7 @@ void TopLevels::split_above(uint32_t cut) {
 
 void TopLevels::choose_splits(const std::vector<uint32_t>& level, const std::vector<Part>& parts) {
     count_parts(parts, [&](const TopNode& top, const Segment& segment, BinCounts& counts) {
-        kernels_.count_bins(segment.references, segment.count, top.node.tight, counts);
+        kernels_.count_bins(top.node, segment.references, segment.count, parameters_, counts);
     });
     for_each_node(level, [&](TopNode& top, BinCounts& counts) {
         top.split = kernels_.choose_split(top.node, counts, parameters_);
@@ -125,7 +126,7 @@ void TopLevels::choose_splits(const std::vector<uint32_t>& level, const std::vec
     }
     count_parts(parts, [&](const TopNode& top, const Segment& segment, BinCounts& counts) {
         if (Interval range; finer_range(top.node, top.split, range)) {
-            kernels_.count_bins_along(top.split.axis, segment.references, segment.count, range.lower, range.upper,
+            kernels_.count_bins_along(top.node, top.split.axis, range, segment.references, segment.count, parameters_,
                                       counts);
         }
     });

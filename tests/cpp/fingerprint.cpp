@@ -83,6 +83,7 @@ void print_all() {
     print_fingerprint("huge soup", moved(make_soup(2000, 3), -3, 1e15F));
     print_fingerprint("furball", make_furball(700));
     print_fingerprint("grid", make_grid(25));
+    print_fingerprint("large grid", make_grid(256));
     print_fingerprint("faulty", make_faulty());
 }
 

@@ -6,6 +6,7 @@
 #include <functional>
 #include <thread>
 
+#include "kdtree/build_kernels.h"
 #include "kdtree/candidate.h"
 #include "kdtree/size_class.h"
 #include "kdtree/traversal.h"
@@ -206,6 +207,24 @@ TEST(Tree, IsTheSameForEveryThreadCount) {
                 EXPECT_TRUE(same_bytes(serial.blocks, parallel.blocks)) << threads;
                 EXPECT_EQ(serial.report.checksum, parallel.report.checksum);
                 EXPECT_EQ(serial.bounds, parallel.bounds);
+            }
+        }
+    }
+}
+
+TEST(Tree, SamplesLargeNodesAlikeOnAnyNumberOfThreads) {
+    const Mesh meshes[] = {make_sphere(520, 128), make_soup(150000, 7, 0.02F)};
+    for (const Mesh& mesh : meshes) {
+        ASSERT_GE(mesh.soup().size(), kSampledFrom);
+        const double best = build(mesh.soup(), {Quality::kBest, 1}).report.sah_cost;
+        for (const Quality quality : {Quality::kDraft, Quality::kBalanced}) {
+            const Tree serial = build(mesh.soup(), {quality, 1});
+            EXPECT_LT(serial.report.sah_cost, 1.15 * best);
+            for (const int threads : {2, 3, 8}) {
+                const Tree parallel = build(mesh.soup(), {quality, threads});
+                EXPECT_TRUE(same_bytes(serial.nodes, parallel.nodes)) << threads;
+                EXPECT_TRUE(same_bytes(serial.wide_nodes, parallel.wide_nodes)) << threads;
+                EXPECT_TRUE(same_bytes(serial.blocks, parallel.blocks)) << threads;
             }
         }
     }
