@@ -53,7 +53,7 @@ constexpr uint32_t kSampledFrom = 1U << 17;
 
 /// Whether the counts of a node are those of a sample. Only where each of its references may be split, so that the
 /// bound on their number does not depend on a sample.
-inline bool is_sampled(const OpenNode& node, const BuildParameters& parameters) {
+HWY_INLINE bool is_sampled(const OpenNode& node, const BuildParameters& parameters) {
     return node.count >= kSampledFrom && node.spare >= node.count && parameters.search == Search::kFinerSlices;
 }
 
@@ -62,7 +62,7 @@ inline bool is_sampled(const OpenNode& node, const BuildParameters& parameters) 
 struct BinCounts {
     alignas(64) uint32_t left[3][kPlanes];
     alignas(64) uint32_t ends_before[3][kPlanes];
-    uint32_t sampled;  ///< how many were counted, if not all
+    uint32_t sampled;  ///< how many were counted, if not all; 0 again once the counts stand for all
 };
 
 struct Interval {
@@ -120,9 +120,9 @@ struct BuildKernels {
     void (*count_bins_along)(const OpenNode& node, int axis, Interval range, const References& references,
                              uint32_t count, const BuildParameters& parameters, BinCounts& counts);
     /// The plane of least cost by the surface area heuristic, or a leaf. Fills in the counts at the ends of the tight
-    /// box.
+    /// box, and makes those of a sample stand for all.
     Split (*choose_split)(const OpenNode& node, BinCounts& counts, const BuildParameters& parameters);
-    /// The cheapest of a split and the planes that cut an interval around it.
+    /// The cheapest of a split and the planes that cut an interval around it, from counts that are treated alike.
     Split (*choose_finer_split)(const OpenNode& node, Split split, Interval range, BinCounts& counts,
                                 const BuildParameters& parameters);
     /// The plane that a node is split at, or a leaf: all of the above on one thread, as far as the parameters ask.

@@ -8,8 +8,8 @@
 namespace espalier {
 namespace {
 
-/// Small enough to share out among the threads, large enough that a segment is still worth a vector loop a few levels
-/// down, of which large scenes have more.
+/// Small enough to share out among the threads and for the cache of one, large enough that a segment is still worth a
+/// vector loop a few levels down.
 uint32_t choose_segment_size(uint32_t triangles, int threads) {
     const uint32_t most = std::max<uint32_t>(8192, triangles / 128);
     return std::clamp<uint32_t>(triangles / (16 * static_cast<uint32_t>(threads)), 1024, most);
