@@ -213,34 +213,39 @@ inline void count_bins_along(int axis, Interval range, const References& referen
     }
 }
 
-inline void count_bins_along(const OpenNode& node, int axis, Interval range, const References& references,
-                             uint32_t count, const BuildParameters& parameters, BinCounts& counts) {
+/// Calls count_some(references, count) for all references, or for a sample of which the axes [begin, end) are filled
+/// in.
+template <class F>
+HWY_INLINE void count_all_or_sample(const OpenNode& node, const References& references, uint32_t count,
+                                    const BuildParameters& parameters, size_t begin, size_t end, BinCounts& counts,
+                                    const F& count_some) {
     if (!is_sampled(node, parameters)) {
-        count_bins_along(axis, range, references, count, counts);
+        count_some(references, count);
         return;
     }
-    const auto a = static_cast<size_t>(axis);
-    sample(references, count, a, a + 1, [&](const References& taken, uint32_t number) {
-        count_bins_along(axis, range, taken, number, counts);
+    sample(references, count, begin, end, [&](const References& taken, uint32_t number) {
+        count_some(taken, number);
         counts.sampled += number;
     });
 }
 
+inline void count_bins_along(const OpenNode& node, int axis, Interval range, const References& references,
+                             uint32_t count, const BuildParameters& parameters, BinCounts& counts) {
+    const auto a = static_cast<size_t>(axis);
+    count_all_or_sample(
+        node, references, count, parameters, a, a + 1, counts,
+        [&](const References& some, uint32_t number) { count_bins_along(axis, range, some, number, counts); });
+}
+
 inline void count_bins(const OpenNode& node, const References& references, uint32_t count,
                        const BuildParameters& parameters, BinCounts& counts) {
-    const auto count_all = [&](const References& some, uint32_t number) {
-        for (int axis = 0; axis < 3; ++axis) {
-            count_bins_along(axis, {node.tight.lower[axis], node.tight.upper[axis]}, some, number, counts);
-        }
-    };
-    if (!is_sampled(node, parameters)) {
-        count_all(references, count);
-        return;
-    }
-    sample(references, count, 0, 3, [&](const References& taken, uint32_t number) {
-        count_all(taken, number);
-        counts.sampled += number;
-    });
+    count_all_or_sample(node, references, count, parameters, 0, 3, counts,
+                        [&](const References& some, uint32_t number) {
+                            for (int axis = 0; axis < 3; ++axis) {
+                                const Interval range{node.tight.lower[axis], node.tight.upper[axis]};
+                                count_bins_along(axis, range, some, number, counts);
+                            }
+                        });
 }
 
 }  // namespace espalier::HWY_NAMESPACE

@@ -163,7 +163,7 @@ HWY_INLINE DepthRange<V> depth_range(const V (&side)[3], V bound, V mz, V z0, V 
 /// counts by at most 2^-149 s, which u s^2 outweighs from s = 2^-125 on.
 template <bool kExact>
 HWY_INLINE uint32_t test_blocks(const TracedRay& ray, const TriangleBlock* block, uint32_t second,
-                                [[maybe_unused]] const float* least_inside_of_class, Verdict& verdict) {
+                                const float* least_inside_of_class, Verdict& verdict) {
     const hn::CappedTag<float, kBlocksPerStep * kBlockSize> d;
     constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<float, kBlocksPerStep * kBlockSize>());
     using V = hn::Vec<decltype(d)>;
@@ -177,18 +177,16 @@ HWY_INLINE uint32_t test_blocks(const TracedRay& ray, const TriangleBlock* block
                                 hn::Set(d, ray.sx),
                                 hn::Set(d, ray.sy),
                                 hn::Set(d, ray.slant)};
+    const V least_inside =
+        kAsksFirst && kExact ? hn::Set(d, least_inside_of_class[block->triangle[0] / kMaxTriangles]) : hn::Zero(d);
     uint32_t possible = 0;
     uint32_t certain = 0;
     for (size_t first = 0; first < kBlockSize; first += kLanes) {
         const Sheared<V> seen(sheared,
                               [&](size_t k, uint32_t axis) { return load(k * 3 * kBlockSize + first + axis); });
         const V inwards = depth_inside(seen.side);  // lanes without a triangle are NaN and fail
-        if constexpr (kAsksFirst) {
-            const uint32_t size_class = block->triangle[0] / kMaxTriangles;
-            const V least = kExact ? hn::Set(d, least_inside_of_class[size_class]) : hn::Zero(d);
-            if (hn::AllFalse(d, hn::Ge(inwards, least))) {
-                continue;
-            }
+        if (kAsksFirst && hn::AllFalse(d, hn::Ge(inwards, least_inside))) {
+            continue;
         }
         V below = hn::Zero(d);
         V mz = below;

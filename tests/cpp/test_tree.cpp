@@ -195,18 +195,22 @@ TEST(Tree, IsWellFormedAndCoversEveryTriangle) {
     }
 }
 
+void expect_same(const Tree& serial, const Tree& parallel) {
+    EXPECT_TRUE(same_bytes(serial.nodes, parallel.nodes));
+    EXPECT_TRUE(same_bytes(serial.wide_nodes, parallel.wide_nodes));
+    EXPECT_TRUE(same_bytes(serial.blocks, parallel.blocks));
+    EXPECT_EQ(serial.report.checksum, parallel.report.checksum);
+    EXPECT_EQ(serial.bounds, parallel.bounds);
+}
+
 TEST(Tree, IsTheSameForEveryThreadCount) {
     const Mesh meshes[] = {make_sphere(120, 200), make_soup(40000, 4), make_furball(3000), make_grid(150)};
     for (const Mesh& mesh : meshes) {
         for (const Quality quality : kQualities) {
             const Tree serial = build(mesh.soup(), {quality, 1});
             for (const int threads : {2, 3, 4, 8, 16}) {
-                const Tree parallel = build(mesh.soup(), {quality, threads});
-                EXPECT_TRUE(same_bytes(serial.nodes, parallel.nodes)) << threads;
-                EXPECT_TRUE(same_bytes(serial.wide_nodes, parallel.wide_nodes)) << threads;
-                EXPECT_TRUE(same_bytes(serial.blocks, parallel.blocks)) << threads;
-                EXPECT_EQ(serial.report.checksum, parallel.report.checksum);
-                EXPECT_EQ(serial.bounds, parallel.bounds);
+                SCOPED_TRACE(threads);
+                expect_same(serial, build(mesh.soup(), {quality, threads}));
             }
         }
     }
@@ -221,10 +225,8 @@ TEST(Tree, SamplesLargeNodesAlikeOnAnyNumberOfThreads) {
             const Tree serial = build(mesh.soup(), {quality, 1});
             EXPECT_LT(serial.report.sah_cost, 1.15 * best);
             for (const int threads : {2, 3, 8}) {
-                const Tree parallel = build(mesh.soup(), {quality, threads});
-                EXPECT_TRUE(same_bytes(serial.nodes, parallel.nodes)) << threads;
-                EXPECT_TRUE(same_bytes(serial.wide_nodes, parallel.wide_nodes)) << threads;
-                EXPECT_TRUE(same_bytes(serial.blocks, parallel.blocks)) << threads;
+                SCOPED_TRACE(threads);
+                expect_same(serial, build(mesh.soup(), {quality, threads}));
             }
         }
     }
