@@ -12,7 +12,6 @@
 #include <hwy/highway.h>
 
 #include <algorithm>
-#include <utility>
 
 #include "kdtree/build_kernels.h"
 #include "kdtree/sah-inl.h"
@@ -58,21 +57,12 @@ HWY_INLINE hn::Mask<D> is_affordable(D d, const OpenNode& node, hn::Vec<DU> left
     return hn::RebindMask(d, hn::Lt(hn::BitCast(di, hn::Add(left, right)), too_many));
 }
 
-/// What a sample's counts at planes within the tight box stand for. On both sides of each lies something: what the box
-/// is tight around.
-inline void scale_up(BinCounts& counts, const OpenNode& node) {
-    if (counts.sampled == 0) {
-        return;
-    }
-    const float ratio = static_cast<float>(node.count) / static_cast<float>(std::exchange(counts.sampled, 0));
-    const auto scale = [&](uint32_t count, uint32_t least, uint32_t most) {
-        const float scaled = std::min(static_cast<float>(count) * ratio, static_cast<float>(most));
-        return std::clamp(static_cast<uint32_t>(scaled), least, most);
-    };
+/// Planes within a tight box have something on both sides, even if a sample has not: what the box is tight around.
+inline void leave_no_side_empty(BinCounts& counts, const OpenNode& node) {
     for (int axis = 0; axis < 3; ++axis) {
         for (int plane = 1; plane < kSlices; ++plane) {
-            counts.left[axis][plane] = scale(counts.left[axis][plane], 1, node.count);
-            counts.ends_before[axis][plane] = scale(counts.ends_before[axis][plane], 0, node.count - 1);
+            counts.left[axis][plane] = std::max(counts.left[axis][plane], 1U);
+            counts.ends_before[axis][plane] = std::min(counts.ends_before[axis][plane], node.count - 1);
         }
     }
 }
@@ -94,7 +84,6 @@ inline Split choose_split(const OpenNode& node, BinCounts& counts, const BuildPa
     if (!may_be_split(node, parameters)) {
         return {};
     }
-    scale_up(counts, node);
     const CellShape shape(node.cell);
     const SplitCosts costs(d, node, shape, parameters.sah);
     CheapestPlane cheapest(d);
@@ -118,10 +107,9 @@ inline Split choose_split(const OpenNode& node, BinCounts& counts, const BuildPa
     return {axis, hn::GetLane(position), cheapest.cost()};
 }
 
-inline Split choose_finer_split(const OpenNode& node, Split split, Interval range, BinCounts& counts,
+inline Split choose_finer_split(const OpenNode& node, Split split, Interval range, const BinCounts& counts,
                                 const BuildParameters& parameters) {
     const hn::CappedTag<float, 16> d;
-    scale_up(counts, node);
     const CellShape shape(node.cell);
     const SplitCosts costs(d, node, shape, parameters.sah);
     CheapestPlane cheapest(d);

@@ -116,6 +116,40 @@ inline uint32_t make_references(const TriangleSoup& soup, uint32_t begin, uint32
     return count;
 }
 
+/// The box of those of the vertices [begin, end) that a face can have.
+inline Box3f bound_vertices(const TriangleSoup& soup, size_t begin, size_t end) {
+    const hn::ScalableTag<float> d;
+    constexpr size_t kLanes = hn::MaxLanes(hn::ScalableTag<float>());
+    const auto limit = hn::Set(d, kMaxCoordinate);
+    hn::Vec<decltype(d)> lowest[3] = {hn::Inf(d), hn::Inf(d), hn::Inf(d)};
+    hn::Vec<decltype(d)> highest[3] = {hn::Neg(hn::Inf(d)), hn::Neg(hn::Inf(d)), hn::Neg(hn::Inf(d))};
+    Box3f box;
+    size_t vertex = begin;
+    for (; vertex + kLanes <= end; vertex += kLanes) {
+        hn::Vec<decltype(d)> v[3];
+        hn::LoadInterleaved3(d, soup.positions.data() + 3 * vertex, v[0], v[1], v[2]);
+        auto valid = hn::Le(hn::Abs(v[0]), limit);
+        valid = hn::And(valid, hn::And(hn::Le(hn::Abs(v[1]), limit), hn::Le(hn::Abs(v[2]), limit)));
+        for (int axis = 0; axis < 3; ++axis) {
+            lowest[axis] = hn::IfThenElse(valid, hn::Min(lowest[axis], v[axis]), lowest[axis]);
+            highest[axis] = hn::IfThenElse(valid, hn::Max(highest[axis], v[axis]), highest[axis]);
+        }
+    }
+    for (; vertex < end; ++vertex) {
+        const float* v = soup.positions.data() + 3 * vertex;
+        if (std::abs(v[0]) <= kMaxCoordinate && std::abs(v[1]) <= kMaxCoordinate && std::abs(v[2]) <= kMaxCoordinate) {
+            box.extend(Box3f{{v[0], v[1], v[2]}, {v[0], v[1], v[2]}});
+        }
+    }
+    Box3f seen;
+    for (int axis = 0; axis < 3; ++axis) {
+        seen.lower[axis] = hn::GetLane(hn::MinOfLanes(d, lowest[axis]));
+        seen.upper[axis] = hn::GetLane(hn::MaxOfLanes(d, highest[axis]));
+    }
+    box.extend(seen);
+    return box;
+}
+
 }  // namespace espalier::HWY_NAMESPACE
 HWY_AFTER_NAMESPACE();
 #endif

@@ -5,7 +5,8 @@
 
 #include <atomic>
 
-#include "kdtree/node.h"
+#include "kdtree/multiway_split.h"
+#include "kdtree/open_node.h"
 #include "kdtree/references.h"
 #include "kdtree/size_class.h"
 #include "kdtree/subtree_output.h"
@@ -38,23 +39,15 @@ struct BuildParameters {
 constexpr int kSlices = 15;
 constexpr int kPlanes = kSlices + 1;
 
-/// A node that is yet to be split.
-struct OpenNode {
-    Box3f cell;      ///< what the planes above leave of the scene's box
-    Box3f tight;     ///< of the references' boxes
-    uint32_t count;  ///< references
-    uint64_t spare;  ///< references that its splits may still add: what bounds the memory of hostile scenes
-    int depth;
-};
+/// Whether a node is split several levels at once (see multiway_split.h). Only where each of its references may be
+/// split.
+HWY_INLINE bool is_multiway(const OpenNode& node, const BuildParameters& parameters) {
+    return node.count >= kMultiwayFrom && node.spare >= node.count && parameters.search == Search::kFinerSlices;
+}
 
-/// Nodes of so many references, more than a processor's own cache holds, are judged by a sample: to read all of them
-/// takes longer than anything else but to partition them.
-constexpr uint32_t kSampledFrom = 1U << 17;
-
-/// Whether the counts of a node are those of a sample. Only where each of its references may be split, so that the
-/// bound on their number does not depend on a sample.
-HWY_INLINE bool is_sampled(const OpenNode& node, const BuildParameters& parameters) {
-    return node.count >= kSampledFrom && node.spare >= node.count && parameters.search == Search::kFinerSlices;
+/// Whether the root is to be split so, too, before there are references at all.
+inline bool is_large(const TriangleSoup& soup, const BuildParameters& parameters) {
+    return soup.size() >= kMultiwayFrom && parameters.search == Search::kFinerSlices;
 }
 
 /// References that begin before plane j, and that end before it, per axis, for the planes between slices. Counts add up
@@ -62,7 +55,6 @@ HWY_INLINE bool is_sampled(const OpenNode& node, const BuildParameters& paramete
 struct BinCounts {
     alignas(64) uint32_t left[3][kPlanes];
     alignas(64) uint32_t ends_before[3][kPlanes];
-    uint32_t sampled;  ///< how many were counted, if not all; 0 again once the counts stand for all
 };
 
 struct Interval {
@@ -96,7 +88,8 @@ struct SubtreeInput {
     const TriangleSoup* soup;
     const BuildParameters* parameters;
     const std::atomic<bool>* cancel;
-    SubtreeSharing* sharing;  ///< null where one thread builds alone
+    SubtreeSharing* sharing;   ///< null where one thread builds alone
+    const SortedNode* sorted;  ///< the node, if it is split several levels at once already
     References references;
     size_t begin;     ///< place of the node's own among them
     size_t room;      ///< from where there is space for right children
@@ -107,29 +100,43 @@ struct SubtreeInput {
 /// many again.
 inline size_t subtree_room(uint32_t count) { return size_t{2} * count + count / 4 + 1024; }
 
+/// Room that will do for a node that is split several levels at once, even if everything straddles every plane.
+inline size_t multiway_room(uint32_t count) { return (MultiwaySplit::kMostLeaves + size_t{2}) * count; }
+
 /// The inner loops of the builder, compiled once for each instruction set. All give the same tree bit for bit.
 struct BuildKernels {
     /// Writes a reference for each valid face of [begin, end) to `out`; returns how many, extends `bounds`, counts the
     /// others.
     uint32_t (*make_references)(const TriangleSoup& soup, uint32_t begin, uint32_t end, const References& out,
                                 Box3f& bounds, RejectedFaces& rejected);
-    /// Adds part of a node's references, or a sample of them, to its counts.
-    void (*count_bins)(const OpenNode& node, const References& references, uint32_t count,
-                       const BuildParameters& parameters, BinCounts& counts);
+    /// Adds part of a node's references to its counts.
+    void (*count_bins)(const OpenNode& node, const References& references, uint32_t count, BinCounts& counts);
     /// The same for one axis and the planes that cut an interval of it.
-    void (*count_bins_along)(const OpenNode& node, int axis, Interval range, const References& references,
-                             uint32_t count, const BuildParameters& parameters, BinCounts& counts);
+    void (*count_bins_along)(int axis, Interval range, const References& references, uint32_t count, BinCounts& counts);
     /// The plane of least cost by the surface area heuristic, or a leaf. Fills in the counts at the ends of the tight
-    /// box, and makes those of a sample stand for all.
+    /// box.
     Split (*choose_split)(const OpenNode& node, BinCounts& counts, const BuildParameters& parameters);
-    /// The cheapest of a split and the planes that cut an interval around it, from counts that are treated alike.
-    Split (*choose_finer_split)(const OpenNode& node, Split split, Interval range, BinCounts& counts,
+    /// The cheapest of a split and the planes that cut an interval around it.
+    Split (*choose_finer_split)(const OpenNode& node, Split split, Interval range, const BinCounts& counts,
                                 const BuildParameters& parameters);
     /// The plane that a node is split at, or a leaf: all of the above on one thread, as far as the parameters ask.
     Split (*find_split)(const OpenNode& node, const References& references, const BuildParameters& parameters);
     /// Sorts references by side, in order; those on both sides go to both. `left` may be `in` itself.
     Partition (*partition)(const TriangleSoup& soup, const References& in, uint32_t count, Split split, bool clip,
                            const References& left, const References& right);
+    /// The box of those of the vertices [begin, end) that a face can have.
+    Box3f (*bound_vertices)(const TriangleSoup& soup, size_t begin, size_t end);
+    /// Makes references of a sample of the faces of a chunk; returns how many.
+    uint32_t (*sample_faces)(const TriangleSoup& soup, uint32_t number, uint32_t shift, const References& to);
+    /// The planes of several levels of a node, chosen by a sample of so many references in a room of sample_room(), of
+    /// which nothing is left.
+    MultiwaySplit (*choose_multiway_split)(const TriangleSoup& soup, const OpenNode& node, const References& sample,
+                                           uint32_t count, const BuildParameters& parameters);
+    /// Sorts a chunk of a node's references by leaves into its places; those on both sides of a plane go to both,
+    /// behind the others. Returns how many places that takes, and does nothing if they are more than `capacity`.
+    size_t (*sort_by_leaves)(const TriangleSoup& soup, const MultiwaySplit& split, const References& chunk,
+                             uint32_t count, bool clip, const References& scratch, size_t capacity,
+                             SortedChunk& sorted);
     /// Appends everything below a node to the output. Throws BuildCancelled.
     void (*build_subtree)(const SubtreeInput& input, const OpenNode& node, SubtreeOutput& output);
     /// Fills blocks from kBlockSize face indices each.

@@ -63,7 +63,7 @@ class Builder {
         std::optional<TopLevels> top;
         std::optional<Subtrees> made(std::in_place, soup_, parameters_, cancel_, threads_, *memory);
         Subtrees& subtrees = *made;
-        if (threads_ == 1) {
+        if (threads_ == 1 && !is_large(soup_, parameters_)) {
             make_references_alone(subtrees);
             phases.bounds = watch.lap();
         } else {
@@ -72,9 +72,13 @@ class Builder {
             phases.bounds = watch.lap();
             tree_.report.rejected_faces = top->rejected();
             tree_.bounds = top->nodes()[0].node.cell;
-            // From then on one node for each thread will do: what one thread splits depth first stays in its cache.
-            top->split_above(soup_.size() / static_cast<uint32_t>(threads_));
-            subtrees.add_below(*top);
+            if (threads_ == 1 && top->sorted_root() != nullptr) {
+                subtrees.add_sorted(*top);
+            } else {
+                // From then on one node for each thread will do: what one thread splits depth first stays in its cache.
+                top->split_above(soup_.size() / static_cast<uint32_t>(threads_));
+                subtrees.add_below(*top);
+            }
             phases.top_levels = watch.lap();
         }
         subtrees.build();

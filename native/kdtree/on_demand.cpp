@@ -248,8 +248,9 @@ uint32_t OnDemand::build_whole(const OpenNode& node, Scratch& scratch) {
     SubtreeOutput& output = scratch.output;
     output.rewind(0, 0);
     const ReferenceBuffer& room = scratch.room;
-    kernels_.build_subtree({&soup_, &parameters_, nullptr, nullptr, room.references(), 0, node.count, room.capacity()},
-                           node, output);
+    kernels_.build_subtree(
+        {&soup_, &parameters_, nullptr, nullptr, nullptr, room.references(), 0, node.count, room.capacity()}, node,
+        output);
     collapse_whole(output.nodes(), output.boxes(), scratch.wide);
     return append(scratch.wide, output.triangles());
 }

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 #pragma once
 
+#include <hwy/base.h>
+
 #include <algorithm>
 #include <array>
 #include <cstddef>
@@ -18,7 +20,7 @@ struct References {
     std::array<float*, 3> upper{};
     uint32_t* triangle = nullptr;
 
-    References at(size_t offset) const {
+    HWY_INLINE References at(size_t offset) const {
         References moved = *this;
         for (size_t axis = 0; axis < 3; ++axis) {
             moved.lower[axis] += offset;

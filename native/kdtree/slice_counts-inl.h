@@ -165,46 +165,6 @@ inline void count_slices(int axis, const float* lower, const float* upper, uint3
 }
 #endif
 
-/// Calls use(references, count) for an eighth of the references, some at a time, of which the axes [begin, end) are
-/// filled in. Which they are depends on their triangles alone, neighbours in the mesh together, whose boxes lie on one
-/// line of the cache as a rule; scattered, since meshes are regular.
-template <class F>
-inline void sample(const References& references, uint32_t count, size_t begin, size_t end, const F& use) {
-    const hn::ScalableTag<float> d;
-    const hn::RebindToUnsigned<decltype(d)> du;
-    constexpr uint32_t kLanes = hn::MaxLanes(hn::ScalableTag<float>());
-    constexpr uint32_t kCapacity = 1024;
-    alignas(64) float bounds[2][3][kCapacity];
-    References taken;
-    for (size_t axis = 0; axis < 3; ++axis) {
-        taken.lower[axis] = bounds[0][axis];
-        taken.upper[axis] = bounds[1][axis];
-    }
-    uint32_t kept = 0;
-    for (uint32_t i = 0; i < count; i += kLanes) {
-        const auto group = hn::ShiftRight<5>(hn::LoadU(du, references.triangle + i));
-        const auto scattered = hn::Mul(group, hn::Set(du, 0x9e3779b1U));
-        const auto is_taken =
-            hn::And(hn::RebindMask(d, hn::Eq(hn::ShiftRight<29>(scattered), hn::Zero(du))), hn::FirstN(d, count - i));
-        if (hn::AllFalse(d, is_taken)) {
-            continue;
-        }
-        const Compression compression(d, is_taken);
-        for (size_t axis = begin; axis < end; ++axis) {
-            compression.store(d, hn::LoadU(d, references.lower[axis] + i), taken.lower[axis] + kept);
-            compression.store(d, hn::LoadU(d, references.upper[axis] + i), taken.upper[axis] + kept);
-        }
-        kept += static_cast<uint32_t>(std::popcount(compression.bits()));
-        if (kept > kCapacity - kLanes) {
-            use(taken, kept);
-            kept = 0;
-        }
-    }
-    if (kept != 0) {
-        use(taken, kept);
-    }
-}
-
 inline void count_bins_along(int axis, Interval range, const References& references, uint32_t count,
                              BinCounts& counts) {
     if (Slices::can_be_cut(range.lower, range.upper)) {
@@ -213,39 +173,11 @@ inline void count_bins_along(int axis, Interval range, const References& referen
     }
 }
 
-/// Calls count_some(references, count) for all references, or for a sample of which the axes [begin, end) are filled
-/// in.
-template <class F>
-HWY_INLINE void count_all_or_sample(const OpenNode& node, const References& references, uint32_t count,
-                                    const BuildParameters& parameters, size_t begin, size_t end, BinCounts& counts,
-                                    const F& count_some) {
-    if (!is_sampled(node, parameters)) {
-        count_some(references, count);
-        return;
+inline void count_bins(const OpenNode& node, const References& references, uint32_t count, BinCounts& counts) {
+    for (int axis = 0; axis < 3; ++axis) {
+        const Interval range{node.tight.lower[axis], node.tight.upper[axis]};
+        count_bins_along(axis, range, references, count, counts);
     }
-    sample(references, count, begin, end, [&](const References& taken, uint32_t number) {
-        count_some(taken, number);
-        counts.sampled += number;
-    });
-}
-
-inline void count_bins_along(const OpenNode& node, int axis, Interval range, const References& references,
-                             uint32_t count, const BuildParameters& parameters, BinCounts& counts) {
-    const auto a = static_cast<size_t>(axis);
-    count_all_or_sample(
-        node, references, count, parameters, a, a + 1, counts,
-        [&](const References& some, uint32_t number) { count_bins_along(axis, range, some, number, counts); });
-}
-
-inline void count_bins(const OpenNode& node, const References& references, uint32_t count,
-                       const BuildParameters& parameters, BinCounts& counts) {
-    count_all_or_sample(node, references, count, parameters, 0, 3, counts,
-                        [&](const References& some, uint32_t number) {
-                            for (int axis = 0; axis < 3; ++axis) {
-                                const Interval range{node.tight.lower[axis], node.tight.upper[axis]};
-                                count_bins_along(axis, range, some, number, counts);
-                            }
-                        });
 }
 
 }  // namespace espalier::HWY_NAMESPACE

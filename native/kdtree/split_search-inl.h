@@ -51,7 +51,7 @@ class SplitSearch {
     Split narrow_down(const OpenNode& node, const References& references, bool is_counted) {
         if (!is_counted) {
             counts_ = {};
-            count_bins(node, references, node.count, parameters_, counts_);
+            count_bins(node, references, node.count, counts_);
         }
         Split split = choose_split(node, counts_, parameters_);
         Interval range;
@@ -59,7 +59,7 @@ class SplitSearch {
             return split;
         }
         BinCounts finer{};
-        count_bins_along(node, split.axis, range, references, node.count, parameters_, finer);
+        count_bins_along(split.axis, range, references, node.count, finer);
         split = choose_finer_split(node, split, range, finer, parameters_);
         if (parameters_.search == Search::kEvents && node.count <= parameters_.one_thread) {
             const float slice = (range.upper - range.lower) * (1.0F / kSlices);

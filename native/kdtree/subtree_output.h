@@ -14,14 +14,9 @@
 #include "geometry/vec.h"
 #include "kdtree/large_buffer.h"
 #include "kdtree/node.h"
+#include "kdtree/open_node.h"
 
 namespace espalier {
-
-struct Split {
-    int axis = -1;  ///< -1: the node is a leaf
-    float position = 0;
-    float cost = 0;
-};
 
 /// A right child that another thread builds: what it makes belongs between the nodes before `node` and those from there
 /// on, and its triangles likewise.

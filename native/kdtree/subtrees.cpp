@@ -11,9 +11,21 @@ namespace espalier {
 void Subtrees::add_whole(const OpenNode& root, ReferenceBuffer references) {
     Subtree& subtree = subtrees_.emplace_back();
     subtree.root = root;
+    subtree.is_gathered = true;
     own_references_ = std::move(references);
     references_ = own_references_.references();
     rooms_.push_back({root.count, own_references_.capacity()});
+    waiting_.push_back(&subtree);
+}
+
+void Subtrees::add_sorted(TopLevels& top) {
+    Subtree& subtree = subtrees_.emplace_back();
+    subtree.root = top.nodes()[0].node;
+    subtree.is_gathered = true;
+    const auto [memory, used] = top.memory();
+    references_ = memory.references();
+    rooms_.push_back({used, memory.capacity()});
+    sorted_ = top.sorted_root();
     waiting_.push_back(&subtree);
 }
 
@@ -32,7 +44,8 @@ void Subtrees::add_below(TopLevels& top) {
 }
 
 /// Lays the references of each subtree side by side behind those of the top levels, whose places then become rooms,
-/// or in memory of their own where there are too few places.
+/// or in memory of their own where there are too few places. Sorted ones are left to the thread that takes the subtree,
+/// in whose cache they then are.
 void Subtrees::gather_all(TopLevels& top) {
     constexpr size_t kMargin = ReferenceBuffer::kSlack;
     const auto threads = static_cast<size_t>(threads_);
@@ -41,11 +54,21 @@ void Subtrees::gather_all(TopLevels& top) {
         count += subtree.root.count + kMargin;
     }
     const auto [memory, used] = top.memory();
+    references_ = memory.references();
+    const uint32_t largest = waiting_.front()->root.count;
+    const auto add_rooms = [&](size_t begin, size_t room) {
+        for (size_t i = 0; i < threads; ++i) {
+            rooms_.push_back({begin + i * room, begin + (i + 1) * room - kMargin});
+        }
+    };
+    if (const size_t room = (memory.capacity() - used) / threads;
+        top.sorted_root() != nullptr && room >= subtree_room(largest) + kMargin) {
+        add_rooms(used, room);
+        return;
+    }
     size_t place = used;
     size_t first_room = 0;
     size_t room = used / threads;
-    references_ = memory.references();
-    const uint32_t largest = waiting_.front()->root.count;
     if (used + count > memory.capacity() || room < largest + largest / 8 + kMargin) {
         room = subtree_room(largest);
         own_references_ = ReferenceBuffer(count + threads * room);
@@ -53,15 +76,14 @@ void Subtrees::gather_all(TopLevels& top) {
         place = 0;
         first_room = count;
     }
-    for (size_t i = 0; i < threads; ++i) {
-        rooms_.push_back({first_room + i * room, first_room + (i + 1) * room - kMargin});
-    }
+    add_rooms(first_room, room);
     struct Copy {
         const Segment* from;
         size_t to;
     };
     std::vector<Copy> copies;
     for (Subtree& subtree : subtrees_) {
+        subtree.is_gathered = true;
         subtree.begin = place;
         for (const Segment& segment : subtree.top->segments) {
             copies.push_back({&segment, place});
@@ -113,6 +135,10 @@ Subtrees::Subtree* Subtrees::take() {
                     next->room = rooms_.back();
                     next->space = next->room.begin;
                     rooms_.pop_back();
+                    if (!next->is_gathered) {
+                        next->begin = next->room.begin;
+                        next->space += next->root.count;
+                    }
                 }
                 return next;
             }
@@ -148,6 +174,7 @@ uint32_t Subtrees::give(const OpenNode& node, const References& references) {
     const std::lock_guard lock(mutex_);
     Subtree& subtree = subtrees_.emplace_back();
     subtree.root = node;
+    subtree.is_gathered = true;
     subtree.begin = room.begin;
     subtree.space = room.begin + node.count;
     subtree.room = room;
@@ -167,9 +194,12 @@ void Subtrees::build_one(Subtree& subtree, int worker) {
     subtree.first_node = output.node_count();
     subtree.first_triangle = output.triangle_count();
     subtree.first_gap = output.gaps().size();
+    if (!subtree.is_gathered) {
+        gather(*subtree.top, references_.at(subtree.begin));
+    }
     SubtreeSharing* sharing = threads_ > 1 ? this : nullptr;
     build_kernels().build_subtree(
-        {&soup_, &parameters_, cancel_, sharing, references_, subtree.begin, subtree.space, subtree.room.end},
+        {&soup_, &parameters_, cancel_, sharing, sorted_, references_, subtree.begin, subtree.space, subtree.room.end},
         subtree.root, output);
     subtree.node_end = output.node_count();
     subtree.triangle_end = output.triangle_count();
@@ -179,7 +209,8 @@ void Subtrees::build_one(Subtree& subtree, int worker) {
 void Subtrees::compact(TopLevels* top, Tree& tree) {
     size_t nodes = 0;
     size_t triangles = 0;
-    if (top == nullptr) {
+    const bool is_whole = top == nullptr || sorted_ != nullptr;
+    if (is_whole) {
         place(subtrees_[0], nodes, triangles);
     } else {
         of_top_.assign(top->nodes().size(), nullptr);
@@ -197,7 +228,7 @@ void Subtrees::compact(TopLevels* top, Tree& tree) {
     LargeBuffer<uint32_t> references = top != nullptr ? top->take_memory() : own_references_.take_memory();
     tree.blocks = std::move(references).reuse_for<TriangleBlock>(triangles / kBlockSize);
     tree.nodes = LargeBuffer<KdNode>(nodes);
-    if (top == nullptr) {
+    if (is_whole) {
         std::copy_n(outputs_[0].nodes().begin(), nodes, tree.nodes.data());
         boxes_ = outputs_[0].boxes();
         triangles_ = outputs_[0].triangles();

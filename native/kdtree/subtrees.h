@@ -28,6 +28,8 @@ class Subtrees : public SubtreeSharing {
 
     /// One subtree that is the whole tree, built where its references lie.
     void add_whole(const OpenNode& root, ReferenceBuffer references);
+    /// The same, its references sorted by the leaves of a multiway split.
+    void add_sorted(TopLevels& top);
     /// A subtree for each node that the top levels left unsplit, its references in one piece.
     void add_below(TopLevels& top);
 
@@ -54,7 +56,8 @@ class Subtrees : public SubtreeSharing {
     struct Subtree {
         OpenNode root;
         const TopNode* top = nullptr;  ///< null for the whole tree and for what was given by a thread
-        size_t begin = 0;              ///< of its references
+        bool is_gathered = false;      ///< whether its references are in one piece
+        size_t begin = 0;              ///< of them
         size_t space = 0;              ///< for right children, to the end of the room
         Room room{};                   ///< none before a thread takes the subtree, but for given ones
         // Where the thread that built it put it:
@@ -99,6 +102,7 @@ class Subtrees : public SubtreeSharing {
     std::vector<Room> rooms_;           ///< in which nothing is built
     std::atomic<uint32_t> changes_{0};  ///< of the five above
 
+    const SortedNode* sorted_ = nullptr;  ///< if that is the one subtree
     References references_;
     ReferenceBuffer own_references_;      ///< where they do not lie in the memory of the top levels
     std::vector<SubtreeOutput> outputs_;  ///< per thread

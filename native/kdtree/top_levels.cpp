@@ -27,7 +27,6 @@ void add(const BinCounts& part, BinCounts& sum) {
             sum.ends_before[axis][j] += part.ends_before[axis][j];
         }
     }
-    sum.sampled += part.sampled;
 }
 
 }  // namespace
@@ -49,6 +48,7 @@ TopLevels::TopLevels(const TriangleSoup& soup, const BuildParameters& parameters
       cancel_(cancel),
       threads_(threads),
       kernels_(build_kernels()),
+      is_large_(is_large(soup, parameters)),
       segment_size_(choose_segment_size(soup.size(), threads)),
       memory_(size_t{5} * soup.size() / 2 + size_t{2} * with_slack(segment_size_) * static_cast<size_t>(threads + 1),
               most_block_bytes(soup.size()), usual_block_bytes(soup.size())),
@@ -63,6 +63,9 @@ void TopLevels::make_references() {
     parallel_for(threads_, bytes / kPages + 1,
                  [&](size_t i) { memory_.first().memory().take_pages(i * kPages, std::min(bytes, (i + 1) * kPages)); });
 
+    if (is_large_ && sort_root()) {
+        return;
+    }
     std::vector<Box3f> bounds(count);
     std::vector<RejectedFaces> rejected(count);
     TopNode root{};
@@ -87,6 +90,136 @@ void TopLevels::make_references() {
     nodes_.push_back(std::move(root));
 }
 
+/// False if a sample has no plane for that.
+bool TopLevels::sort_root() {
+    root_.split = choose_multiway_split();
+    if (root_.split.leaves == 1) {
+        return false;
+    }
+    sort_faces();
+    if (!root_.add_up()) {
+        root_ = {};
+        rejected_ = {};
+        return false;
+    }
+    add_nodes(root_.split.root, root_.node.cell, 0);
+    return true;
+}
+
+MultiwaySplit TopLevels::choose_multiway_split() {
+    const uint32_t triangles = soup_.size();
+    const uint32_t shift = sampling_shift(triangles);
+    const ReferenceBuffer sample(sample_room((triangles >> shift) + kChunk));
+    constexpr size_t kVertices = 16384;
+    const size_t vertices = soup_.positions.size() / 3;
+    std::vector<Box3f> boxes((vertices + kVertices - 1) / kVertices);
+    parallel_for(threads_, boxes.size(), [&](size_t i) {
+        boxes[i] = kernels_.bound_vertices(soup_, i * kVertices, std::min(vertices, (i + 1) * kVertices));
+    });
+    Box3f bounds;
+    for (const Box3f& box : boxes) {
+        bounds.extend(box);
+    }
+    // All threads together, each chunk where it would be if no face before it were faulty.
+    const size_t chunks = (triangles + kChunk - 1) / kChunk;
+    const uint32_t most = kChunk >> shift;
+    std::vector<uint32_t> taken(chunks);
+    parallel_for(threads_, chunks, [&](size_t i) {
+        taken[i] = kernels_.sample_faces(soup_, static_cast<uint32_t>(i), shift, sample.references().at(i * most));
+    });
+    uint32_t sampled = 0;
+    for (size_t i = 0; i < chunks; ++i) {
+        if (sampled != i * most) {
+            copy_references(sample.references().at(i * most), taken[i], sample.references().at(sampled));
+        }
+        sampled += taken[i];
+    }
+    const OpenNode root{bounds, bounds, triangles, spare_references(triangles), 0};
+    return kernels_.choose_multiway_split(soup_, root, sample.references(), sampled, parameters_);
+}
+
+void TopLevels::sort_faces() {
+    const uint32_t triangles = soup_.size();
+    const size_t count = (triangles + kChunk - 1) / kChunk;
+    constexpr size_t kUsual = kChunk + kChunk / 2;
+    struct Worker {
+        References places;
+        size_t room = 0;
+        ReferenceBuffer scratch;
+        Box3f bounds;
+        RejectedFaces rejected;
+        uint32_t valid = 0;
+    };
+    std::vector<Worker> workers(static_cast<size_t>(threads_));
+    root_.chunks.resize(count);
+    parallel_for(threads_, count, [&](size_t i, int number) {
+        if (cancel_ != nullptr && cancel_->load(std::memory_order_relaxed)) {
+            throw BuildCancelled();
+        }
+        Worker& worker = workers[static_cast<size_t>(number)];
+        if (worker.scratch.references().triangle == nullptr) {
+            worker.scratch = ReferenceBuffer(SortedChunk::kScratch, 0, 0);
+        }
+        const auto begin = static_cast<uint32_t>(i) * kChunk;
+        const References made = worker.scratch.references();
+        const uint32_t valid = kernels_.make_references(soup_, begin, std::min(begin + kChunk, triangles), made,
+                                                        worker.bounds, worker.rejected);
+        worker.valid += valid;
+        for (size_t wanted = kUsual;;) {
+            if (worker.room < wanted) {
+                worker.room = std::max(wanted, 8 * kUsual);
+                worker.places = memory_.take(static_cast<uint32_t>(worker.room));
+            }
+            root_.chunks[i].places = worker.places;
+            wanted = kernels_.sort_by_leaves(soup_, root_.split, made, valid, parameters_.clip,
+                                             made.at(kChunk + SortedChunk::kMargin), worker.room, root_.chunks[i]);
+            if (wanted <= worker.room) {
+                worker.places = worker.places.at(wanted);
+                worker.room -= wanted;
+                return;
+            }
+        }
+    });
+    Box3f box;
+    uint32_t valid = 0;
+    for (const Worker& worker : workers) {
+        box.extend(worker.bounds);
+        valid += worker.valid;
+        rejected_ += worker.rejected;
+    }
+    root_.node = {box, box, valid, spare_references(triangles), 0};
+}
+
+/// Appends the nodes of the multiway split below a child; returns the index of the first.
+uint32_t TopLevels::add_nodes(uint32_t child, const Box3f& cell, int depth) {
+    const auto index = static_cast<uint32_t>(nodes_.size());
+    nodes_.emplace_back();
+    child = root_.skip_planes_beside(cell, child);
+    if (MultiwaySplit::is_leaf(child)) {
+        TopNode& leaf = nodes_[index];
+        leaf.node = root_.leaf(child, cell, depth);
+        for (const SortedChunk& chunk : root_.chunks) {
+            if (const uint32_t count = chunk.count[child]; count != 0) {
+                leaf.segments.push_back({chunk.places.at(chunk.begin[child]), count, count});
+            }
+        }
+        return index;
+    }
+    const MultiwaySplit::Branch& branch = root_.split.branch(child);
+    Box3f left_cell = cell;
+    Box3f right_cell = cell;
+    left_cell.upper[branch.split.axis] = right_cell.lower[branch.split.axis] = branch.split.position;
+    const uint32_t left = add_nodes(branch.child[0], left_cell, depth + 1);
+    const uint32_t right = add_nodes(branch.child[1], right_cell, depth + 1);
+    TopNode& node = nodes_[index];
+    node.node = {cell, nodes_[left].node.tight, nodes_[left].node.count + nodes_[right].node.count, 0, depth};
+    node.node.tight.extend(nodes_[right].node.tight);
+    node.split = branch.split;
+    node.left = left;
+    node.right = right;
+    return index;
+}
+
 std::vector<TopLevels::Part> TopLevels::parts_of(const std::vector<uint32_t>& nodes) const {
     std::vector<Part> parts;
     for (const uint32_t node : nodes) {
@@ -98,6 +231,9 @@ std::vector<TopLevels::Part> TopLevels::parts_of(const std::vector<uint32_t>& no
 }
 
 void TopLevels::split_above(uint32_t cut) {
+    if (is_large_) {
+        return;  // what is left to do is done best where one thread splits depth first
+    }
     std::vector<uint32_t> level{0};
     for (;;) {
         std::erase_if(level,
@@ -116,7 +252,7 @@ void TopLevels::split_above(uint32_t cut) {
 
 void TopLevels::choose_splits(const std::vector<uint32_t>& level, const std::vector<Part>& parts) {
     count_parts(parts, [&](const TopNode& top, const Segment& segment, BinCounts& counts) {
-        kernels_.count_bins(top.node, segment.references, segment.count, parameters_, counts);
+        kernels_.count_bins(top.node, segment.references, segment.count, counts);
     });
     for_each_node(level, [&](TopNode& top, BinCounts& counts) {
         top.split = kernels_.choose_split(top.node, counts, parameters_);
@@ -126,8 +262,7 @@ void TopLevels::choose_splits(const std::vector<uint32_t>& level, const std::vec
     }
     count_parts(parts, [&](const TopNode& top, const Segment& segment, BinCounts& counts) {
         if (Interval range; finer_range(top.node, top.split, range)) {
-            kernels_.count_bins_along(top.node, top.split.axis, range, segment.references, segment.count, parameters_,
-                                      counts);
+            kernels_.count_bins_along(top.split.axis, range, segment.references, segment.count, counts);
         }
     });
     for_each_node(level, [&](TopNode& top, BinCounts& counts) {

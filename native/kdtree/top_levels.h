@@ -60,9 +60,10 @@ class TopLevels {
     TopLevels(const TriangleSoup& soup, const BuildParameters& parameters, const std::atomic<bool>* cancel,
               int threads);
 
-    /// Phase 1: boxes of all faces that can be hit.
+    /// Phase 1: boxes of all faces that can be hit. Those of a large scene are sorted as they are made by the leaves of
+    /// a multiway split, so that they go through memory once.
     void make_references();
-    /// Phase 2: splits every node of more than `cut` references, breadth first.
+    /// Phase 2: splits every node of more than `cut` references, breadth first, but for a large scene's.
     void split_above(uint32_t cut);
 
     const std::vector<TopNode>& nodes() const { return nodes_; }
@@ -71,12 +72,18 @@ class TopLevels {
     UsedReferences memory() { return {memory_.first(), memory_.used()}; }
     /// Gives away the memory of the references, for when they are no longer needed.
     LargeBuffer<uint32_t> take_memory() { return memory_.take_memory(); }
+    /// The root, if it is split several levels at once, or null.
+    const SortedNode* sorted_root() const { return root_.split.leaves > 1 ? &root_ : nullptr; }
 
  private:
     struct Part {
         uint32_t node;
         uint32_t segment;
     };
+    bool sort_root();
+    MultiwaySplit choose_multiway_split();
+    void sort_faces();
+    uint32_t add_nodes(uint32_t child, const Box3f& cell, int depth);
     std::vector<Part> parts_of(const std::vector<uint32_t>& nodes) const;
     void choose_splits(const std::vector<uint32_t>& level, const std::vector<Part>& parts);
     /// Counts the references of each part, all threads together.
@@ -94,8 +101,10 @@ class TopLevels {
     const std::atomic<bool>* cancel_;
     const int threads_;
     const BuildKernels& kernels_;
+    const bool is_large_;  ///< whether the root is split several levels at once, if it can be
     const uint32_t segment_size_;
     SegmentMemory memory_;
+    SortedNode root_;  ///< of one leaf, if the scene is not sorted
     std::vector<TopNode> nodes_;
     std::vector<BinCounts> counts_;    ///< per part
     std::vector<References> scratch_;  ///< per thread

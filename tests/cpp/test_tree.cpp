@@ -216,13 +216,28 @@ TEST(Tree, IsTheSameForEveryThreadCount) {
     }
 }
 
-TEST(Tree, SamplesLargeNodesAlikeOnAnyNumberOfThreads) {
-    const Mesh meshes[] = {make_sphere(520, 128), make_soup(150000, 7, 0.02F)};
+/// A large scene with faults: a whole chunk of faces without an area, some here and there, and vertices of no face.
+Mesh make_large_faulty() {
+    Mesh mesh = make_sphere(540, 128);
+    for (size_t face = 0; face < mesh.triangles.size() / 3; face += face < 2 * kChunk ? 1 : 1000) {
+        if (face >= kChunk) {
+            mesh.triangles[3 * face + 1] = mesh.triangles[3 * face];
+        }
+    }
+    mesh.add_vertex({-1, -2, 7});
+    mesh.add_vertex({NAN, 0, 0});
+    return mesh;
+}
+
+TEST(Tree, SplitsLargeScenesAlikeOnAnyNumberOfThreads) {
+    const Mesh meshes[] = {make_sphere(520, 128), make_soup(150000, 7, 0.02F), make_large_faulty()};
     for (const Mesh& mesh : meshes) {
-        ASSERT_GE(mesh.soup().size(), kSampledFrom);
+        ASSERT_GE(mesh.soup().size(), kMultiwayFrom);
         const double best = build(mesh.soup(), {Quality::kBest, 1}).report.sah_cost;
         for (const Quality quality : {Quality::kDraft, Quality::kBalanced}) {
+            SCOPED_TRACE(testing::Message() << "mesh " << &mesh - meshes << ", quality " << static_cast<int>(quality));
             const Tree serial = build(mesh.soup(), {quality, 1});
+            expect_well_formed(serial);
             EXPECT_LT(serial.report.sah_cost, 1.15 * best);
             for (const int threads : {2, 3, 8}) {
                 SCOPED_TRACE(threads);
@@ -230,6 +245,25 @@ TEST(Tree, SamplesLargeNodesAlikeOnAnyNumberOfThreads) {
             }
         }
     }
+}
+
+TEST(Tree, CoversEveryTriangleOfLargeScenes) {
+    const Mesh mesh = make_soup(135000, 13, 0.1F);
+    for (const Quality quality : {Quality::kDraft, Quality::kBalanced}) {
+        const Tree tree = build(mesh.soup(), {quality, 2});
+        ASSERT_EQ(tree.report.rejected_faces.no_area, 0U);
+        expect_well_formed(tree);
+        expect_everything_covered(mesh, tree);
+        EXPECT_GT(tree.report.references, mesh.soup().size() * 5 / 4) << "hardly any triangle straddles a plane";
+    }
+}
+
+TEST(Tree, SplitsLargeNodesOfLargerScenesLikewise) {
+    const Mesh mesh = make_grid(1100);
+    ASSERT_GT(mesh.soup().size() / MultiwaySplit::kMostLeaves, kMultiwayFrom);
+    const Tree serial = build(mesh.soup(), {Quality::kDraft, 1});
+    expect_well_formed(serial);
+    expect_same(serial, build(mesh.soup(), {Quality::kDraft, 2}));
 }
 
 TEST(Tree, ReportAddsUp) {
@@ -352,6 +386,40 @@ TEST(Tree, BoundsItsReferencesOnHostileScenes) {
     Hit hit{};
     intersect(tree, {&ray, 1}, {&hit, 1});
     EXPECT_EQ(hit.triangle, 0) << "of equal distances the lowest index wins";
+}
+
+/// Small triangles where a sample of the faces is taken (see multiway-inl.h), and elsewhere such as lie in all leaves.
+Mesh make_misleading(uint32_t count) {
+    constexpr uint32_t kGroup = 16;
+    const uint32_t shift = sampling_shift(count);
+    Mesh mesh = make_soup(count, 8, 0.001F);
+    for (uint32_t face = 0; face < count; ++face) {
+        const uint32_t group = face / kGroup;
+        if ((group >> shift) * 0x9e3779b1U >> (32 - shift) != group % (1U << shift)) {
+            float* corner = &mesh.positions[size_t{9} * face];
+            std::fill(corner, corner + 3, 0.0F);
+            std::fill(corner + 3, corner + 6, 1.0F);
+        }
+    }
+    return mesh;
+}
+
+TEST(Tree, BoundsItsReferencesOnLargeHostileScenes) {
+    Mesh copies;
+    for (uint32_t i = 0; i < kMultiwayFrom; ++i) {
+        copies.add_triangle({0, 0, 0}, {1, 0, 0.5F}, {0, 1, 0});
+    }
+    const Mesh meshes[] = {copies, make_furball(kMultiwayFrom), make_soup(kMultiwayFrom, 5, 4),
+                           make_misleading(MultiwaySplit::kMostLeaves * kMultiwayLeaf)};
+    for (const Mesh& mesh : meshes) {
+        for (const Quality quality : {Quality::kDraft, Quality::kBalanced}) {
+            SCOPED_TRACE(testing::Message() << "mesh " << &mesh - meshes << ", quality " << static_cast<int>(quality));
+            const Tree serial = build(mesh.soup(), {quality, 1});
+            EXPECT_LE(serial.report.references, uint64_t{7} * serial.report.triangles + 1024);
+            expect_well_formed(serial);
+            expect_same(serial, build(mesh.soup(), {quality, 2}));
+        }
+    }
 }
 
 TEST(Tree, CanBeCancelled) {
