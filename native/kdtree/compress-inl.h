@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// Compression of 32-bit lanes by a mask, whose cost is shared by all vectors that one mask compresses. Highway 1.0.3
-// has the same, but copies its table to the stack at every call where the instruction set lacks a compress instruction.
-// Compiled once per instruction set (see build_kernels.cpp).
+// Masks as bits, and compression of 32-bit lanes by a mask, whose cost is shared by all vectors that one mask
+// compresses. Highway 1.0.3 has the same, but copies its table to the stack at every call where the instruction set
+// lacks a compress instruction. Compiled once per instruction set (see build_kernels.cpp).
 
 #if defined(ESPALIER_KDTREE_COMPRESS_INL_H_) == defined(HWY_TARGET_TOGGLE)
 #ifdef ESPALIER_KDTREE_COMPRESS_INL_H_
@@ -20,18 +20,31 @@ HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
 namespace hn = hwy::HWY_NAMESPACE;
 
+/// A mask as bits, the first lane's lowest.
 template <class D>
 HWY_INLINE uint64_t mask_bits(D d, hn::Mask<D> mask) {
+    uint64_t bits = 0;
 #if HWY_TARGET == HWY_AVX3_DL
+    // The move is written out, since GCC 12 was seen to save 16 bits of a mask to the stack and to load 64 of them,
+    // when left to widen it itself; Embree met the same (RenderKit/embree, pull request 574).
+    constexpr size_t kLanes = hn::MaxLanes(D());
+    if constexpr (kLanes == 64) {
+        asm("kmovq %1, %0" : "=r"(bits) : "k"(mask.raw));
+    } else if constexpr (kLanes == 32) {
+        asm("kmovd %1, %k0" : "=r"(bits) : "k"(mask.raw));
+    } else if constexpr (kLanes == 16) {
+        asm("kmovw %1, %k0" : "=r"(bits) : "k"(mask.raw));
+    } else {
+        asm("kmovb %1, %k0" : "=r"(bits) : "k"(mask.raw));
+        bits &= (uint64_t{1} << kLanes) - 1;
+    }
     (void)d;
-    return mask.raw;
 #else
     uint8_t bytes[8] = {};
     hn::StoreMaskBits(d, mask, bytes);
-    uint64_t bits = 0;
     std::memcpy(&bits, bytes, sizeof bits);
-    return bits;
 #endif
+    return bits;
 }
 
 /// For each mask of so many lanes, which lane goes where: the chosen ones first, in order.

@@ -106,7 +106,7 @@ class EventSweep {
                 const Compression chosen(d, hn::RebindMask(d, hn::AndNot(hn::Or(is_before, is_behind), exists)));
                 chosen.store(di, keys, to + inside);
                 inside += static_cast<uint32_t>(std::popcount(chosen.bits()));
-                before += static_cast<uint32_t>(hn::CountTrue(di, hn::And(exists, is_before)));
+                before += static_cast<uint32_t>(std::popcount(mask_bits(di, hn::And(exists, is_before))));
             };
             collect(begin, begins_.data(), begin_count_, begun_);
             collect(end, ends_.data(), end_count_, ended_);

@@ -17,6 +17,7 @@
 #include <limits>
 
 #include "kdtree/candidate.h"
+#include "kdtree/compress-inl.h"
 #include "kdtree/node.h"
 #include "kdtree/traversal.h"
 
@@ -30,14 +31,7 @@ constexpr float kInfinity = std::numeric_limits<float>::infinity();
 /// processors more than a hundred cycles an operation.
 constexpr float kTiny = 0x1p-120F;
 
-template <class D, class M>
-HWY_INLINE uint32_t mask_bits(D d, M mask) {
-    uint64_t bits = 0;  // Highway wants room for 8 bytes
-    hn::StoreMaskBits(d, mask, reinterpret_cast<uint8_t*>(&bits));
-    return static_cast<uint32_t>(bits);
-}
-
-/// The other way.
+/// A mask of such bits as mask_bits returns.
 template <class D>
 HWY_INLINE hn::Mask<D> mask_of(D d, uint32_t bits) {
     const uint64_t room = bits;  // Highway reads 8 bytes
@@ -63,44 +57,15 @@ HWY_INLINE V largest_of(const V (&c)[3]) {
     return largest_of(largest_of(c[0], c[1]), c[2]);
 }
 
-#if HWY_TARGET == HWY_AVX2
-/// Per mask of eight lanes the numbers of its set lanes in order, 4 bits each. Highway has such a table too, but copies
-/// it onto the stack at each use.
-struct CompressTable {
-    uint32_t lanes[256];
-    constexpr CompressTable() : lanes() {
-        for (uint32_t mask = 0; mask < 256; ++mask) {
-            uint32_t shift = 0;
-            for (uint32_t lane = 0; lane < 8; ++lane) {
-                if ((mask >> lane & 1U) != 0) {
-                    lanes[mask] |= lane << shift;
-                    shift += 4;
-                }
-            }
-        }
-    }
-};
-inline constexpr CompressTable kCompressTable;
-#endif
-
 /// Stores those lanes of two vectors that a mask selects, without gaps; what lies behind them is overwritten. Returns
 /// their number.
 template <class D>
 HWY_INLINE size_t compress_pair(D d, hn::Mask<D> mask, hn::Vec<hn::RebindToUnsigned<D>> a, uint32_t* to_a, hn::Vec<D> b,
                                 float* to_b) {
-    const hn::RebindToUnsigned<D> du;
-#if HWY_TARGET == HWY_AVX2
-    const uint32_t bits = mask_bits(d, mask);
-    const auto packed = hn::Set(du, kCompressTable.lanes[bits]);
-    const auto lanes = hn::And(hn::Shr(packed, hn::Mul(hn::Iota(du, 0), hn::Set(du, 4))), hn::Set(du, 7));
-    hn::StoreU(hn::TableLookupLanes(a, hn::IndicesFromVec(du, lanes)), du, to_a);
-    hn::StoreU(hn::TableLookupLanes(b, hn::IndicesFromVec(d, lanes)), d, to_b);
-    return static_cast<size_t>(std::popcount(bits));
-#else
-    hn::StoreU(hn::Compress(a, hn::RebindMask(du, mask)), du, to_a);
-    hn::StoreU(hn::Compress(b, mask), d, to_b);
-    return hn::CountTrue(d, mask);
-#endif
+    const Compression compression(d, mask);
+    compression.store(hn::RebindToUnsigned<D>(), a, to_a);
+    compression.store(d, b, to_b);
+    return static_cast<size_t>(std::popcount(compression.bits()));
 }
 
 /// The axes in such an order that z has a direction's largest component; found without branches, which rays in all
