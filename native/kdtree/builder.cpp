@@ -85,7 +85,7 @@ class Builder {
         phases.subtrees = watch.lap();
         subtrees.compact(top ? &*top : nullptr, tree_);
         phases.compaction = watch.lap();
-        build_layout(soup_, subtrees.boxes(), subtrees.triangles(), threads_, *memory, tree_);
+        build_layout(soup_, subtrees.pieces(), threads_, *memory, tree_);
         made.reset();  // giving memory back is part of what a build costs
         top.reset();
         memory.reset();

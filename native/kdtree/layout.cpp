@@ -34,6 +34,7 @@ struct Item {
     uint32_t blocks;       ///< of a leaf; 0 for an inner node
     uint32_t part;         ///< of a leaf: where the boxes of its parts begin
     float area;
+    const TreePiece* piece;  ///< which holds the node
     Box3f box;
 
     void set_box(const Box3f& new_box) {
@@ -44,19 +45,20 @@ struct Item {
 
 class Collapse {
  public:
-    Collapse(std::span<const KdNode> nodes, const TightBoxes& boxes) : nodes_(nodes), boxes_(boxes) {}
+    Collapse(std::span<const KdNode> nodes, std::span<const TreePiece> pieces) : nodes_(nodes), pieces_(pieces) {}
 
     /// Appends the wide node for a kd node and all below it; returns its index. A kd node listed in `runs` is not
     /// entered: its child code is the index of its run, marked for the caller to resolve.
     uint32_t collapse(uint32_t kd_node, WideNodes& out, const std::vector<Run>* runs) const {
-        return collapse(item(kd_node), out, runs);
+        return collapse(item(kd_node, pieces_.front()), out, runs);
     }
 
  private:
-    Item item(uint32_t node) const {
+    /// near: the piece that most likely holds the node.
+    Item item(uint32_t node, const TreePiece& near) const {
         const KdNode kd = nodes_[node];
-        Item made{node, 0, 0, 0, 0, {}};
-        made.set_box(boxes_.nodes[node]);
+        Item made{node, 0, 0, 0, 0, near.holds(node) ? &near : &piece_of(pieces_, node), {}};
+        made.set_box(made.piece->box(node));
         if (kd.is_leaf()) {
             made.first_block = made.part = kd.first_block();
             made.blocks = block_count(kd.references());
@@ -148,11 +150,11 @@ class Collapse {
             const uint32_t right = kd.right_child();
             axis = kd.axis();
             if (is_empty(left) || is_empty(right)) {  // an empty leaf takes no place
-                items[static_cast<size_t>(slot)] = item(is_empty(left) ? right : left);
+                items[static_cast<size_t>(slot)] = item(is_empty(left) ? right : left, *opened.piece);
                 return;
             }
-            items[static_cast<size_t>(slot)] = item(left);
-            items[static_cast<size_t>(count)] = item(right);
+            items[static_cast<size_t>(slot)] = item(left, *opened.piece);
+            items[static_cast<size_t>(count)] = item(right, *opened.piece);
         }
         order.split(axis, slot, count);
         ++count;
@@ -163,13 +165,13 @@ class Collapse {
         Item first = leaf;
         first.blocks = first_blocks(leaf.blocks);
         first.part = leaf.part + 1;
-        first.set_box(boxes_.parts[leaf.part]);
+        first.set_box(leaf.piece->part_box(leaf.part));
         Item second = leaf;
         second.first_block += first.blocks;
         second.blocks -= first.blocks;
         const uint32_t slot = first.part + part_count(first.blocks);
         second.part = slot + 1;
-        second.set_box(boxes_.parts[slot]);
+        second.set_box(leaf.piece->part_box(slot));
         return {first, second};
     }
 
@@ -218,7 +220,7 @@ class Collapse {
     }
 
     std::span<const KdNode> nodes_;
-    const TightBoxes& boxes_;
+    std::span<const TreePiece> pieces_;
 };
 
 /// Lists the runs below a node in depth-first order.
@@ -235,24 +237,43 @@ void find_runs(const Tree& tree, uint32_t begin, uint32_t end, uint32_t longest,
     find_runs(tree, node.right_child(), end, longest, runs);
 }
 
+/// Blocks that one thread writes in one go.
+struct BlockTask {
+    const uint32_t* triangles;
+    size_t count;
+    size_t place;
+};
+
+std::vector<BlockTask> cut_to_tasks(std::span<const TreePiece> pieces) {
+    constexpr size_t kMost = 512;
+    std::vector<BlockTask> tasks;
+    for (const TreePiece& piece : pieces) {
+        const size_t blocks = piece.triangles.size() / kBlockSize;
+        for (size_t begin = 0; begin < blocks; begin += kMost) {
+            tasks.push_back({piece.triangles.data() + begin * kBlockSize, std::min(kMost, blocks - begin),
+                             piece.first_block + begin});
+        }
+    }
+    return tasks;
+}
+
 /// How many wide nodes so many kd nodes and blocks may become.
 size_t most_nodes(size_t nodes, size_t blocks) { return nodes + blocks / (WideNode::kMaxLeafBlocks / 2) + 1; }
 
 }  // namespace
 
-void collapse_whole(std::span<const KdNode> nodes, const TightBoxes& boxes, WideNodes& out) {
-    const size_t most = most_nodes(nodes.size(), boxes.parts.size());
+void collapse_whole(std::span<const KdNode> nodes, const TreePiece& piece, WideNodes& out) {
+    const size_t most = most_nodes(nodes.size(), piece.part_boxes.size());
     if (out.capacity() < most) {
         out = WideNodes(2 * most, most / 8);
     }
     out.clear();
-    Collapse(nodes, boxes).collapse(0, out, nullptr);
+    Collapse(nodes, {&piece, 1}).collapse(0, out, nullptr);
 }
 
-void build_layout(const TriangleSoup& soup, const TightBoxes& boxes, std::span<const uint32_t> triangles, int threads,
-                  TransientMemory& memory, Tree& tree) {
-    constexpr size_t kBlocksPerTask = 512;
-    const size_t blocks = triangles.size() / kBlockSize;
+void build_layout(const TriangleSoup& soup, std::span<const TreePiece> pieces, int threads, TransientMemory& memory,
+                  Tree& tree) {
+    const size_t blocks = tree.blocks.size();
     const auto nodes = static_cast<uint32_t>(tree.nodes.size());
     if (blocks == 0) {
         return;
@@ -260,12 +281,12 @@ void build_layout(const TriangleSoup& soup, const TightBoxes& boxes, std::span<c
     std::vector<Run> runs;
     find_runs(tree, 0, nodes, run_length(nodes), runs);
 
-    const Collapse collapse(tree.nodes.span(), boxes);
+    const std::vector<BlockTask> block_tasks = cut_to_tasks(pieces);
+    const Collapse collapse(tree.nodes.span(), pieces);
     const SizeClasses classes(tree.bounds);
     const size_t most_wide_nodes = most_nodes(nodes, blocks);
     std::vector<WideNodes> made(static_cast<size_t>(threads));
-    const size_t block_tasks = (blocks + kBlocksPerTask - 1) / kBlocksPerTask;
-    parallel_for(threads, runs.size() + block_tasks, [&](size_t i, int worker) {
+    parallel_for(threads, runs.size() + block_tasks.size(), [&](size_t i, int worker) {
         if (i < runs.size()) {
             WideNodes& mine = made[static_cast<size_t>(worker)];
             if (mine.data() == nullptr) {
@@ -278,10 +299,8 @@ void build_layout(const TriangleSoup& soup, const TightBoxes& boxes, std::span<c
             runs[i].made_at = first;
             return;
         }
-        const size_t begin = (i - runs.size()) * kBlocksPerTask;
-        const size_t count = std::min(kBlocksPerTask, blocks - begin);
-        build_kernels().write_blocks(soup, classes, triangles.data() + begin * kBlockSize, count,
-                                     tree.blocks.data() + begin);
+        const BlockTask& task = block_tasks[i - runs.size()];
+        build_kernels().write_blocks(soup, classes, task.triangles, task.count, tree.blocks.data() + task.place);
     });
 
     // The wide nodes above the runs, whose number is small. A tree that is one run has none.

@@ -251,7 +251,7 @@ uint32_t OnDemand::build_whole(const OpenNode& node, Scratch& scratch) {
     kernels_.build_subtree(
         {&soup_, &parameters_, nullptr, nullptr, nullptr, room.references(), 0, node.count, room.capacity()}, node,
         output);
-    collapse_whole(output.nodes(), output.boxes(), scratch.wide);
+    collapse_whole(output.nodes(), output.whole(), scratch.wide);
     return append(scratch.wide, output.triangles());
 }
 

@@ -15,6 +15,7 @@
 #include "kdtree/large_buffer.h"
 #include "kdtree/node.h"
 #include "kdtree/open_node.h"
+#include "kdtree/tree_piece.h"
 
 namespace espalier {
 
@@ -25,13 +26,6 @@ struct Gap {
     size_t node;
     size_t triangle;
     uint32_t subtree;  ///< which belongs there
-};
-
-/// Boxes of what lies in the nodes, and in the parts of leaves (see node.h): of the first part, of all parts of that,
-/// and likewise of the second, from the place on that is the number of the leaf's first block.
-struct TightBoxes {
-    std::span<const Box3f> nodes;
-    std::span<const Box3f> parts;
 };
 
 /// The subtrees that one thread builds: nodes depth first, the tight box of each, and the triangles of the leaves in
@@ -49,8 +43,18 @@ class SubtreeOutput {
     size_t node_count() const { return node_count_; }
     size_t triangle_count() const { return triangle_count_; }
     std::span<const KdNode> nodes() const { return {nodes_, node_count_}; }
-    TightBoxes boxes() const { return {{boxes_, node_count_}, {part_boxes_, triangle_count_ / kBlockSize}}; }
     std::span<const uint32_t> triangles() const { return {triangles_, triangle_count_}; }
+    /// What lies between these counts of nodes and triangles, which have those places in the finished tree.
+    TreePiece piece(size_t node, size_t node_end, size_t triangle, size_t triangle_end, size_t node_place,
+                    size_t block_place) const {
+        return {static_cast<uint32_t>(node_place),
+                static_cast<uint32_t>(block_place),
+                {boxes_ + node, node_end - node},
+                {part_boxes_ + triangle / kBlockSize, (triangle_end - triangle) / kBlockSize},
+                {triangles_ + triangle, triangle_end - triangle}};
+    }
+    /// All of it, where that is the whole tree.
+    TreePiece whole() const { return piece(0, node_count_, 0, triangle_count_, 0, 0); }
 
     /// Takes the place of an inner node, before its left child is written; returns its index.
     HWY_INLINE size_t open_inner() {

@@ -215,6 +215,7 @@ void Subtrees::compact(TopLevels* top, Tree& tree) {
     } else {
         of_top_.assign(top->nodes().size(), nullptr);
         top_places_.assign(top->nodes().size(), 0);
+        top_boxes_.resize(top->nodes().size());
         for (Subtree& subtree : subtrees_) {
             if (subtree.top != nullptr) {
                 of_top_[static_cast<size_t>(subtree.top - top->nodes().data())] = &subtree;
@@ -230,22 +231,13 @@ void Subtrees::compact(TopLevels* top, Tree& tree) {
     tree.nodes = LargeBuffer<KdNode>(nodes);
     if (is_whole) {
         std::copy_n(outputs_[0].nodes().begin(), nodes, tree.nodes.data());
-        boxes_ = outputs_[0].boxes();
-        triangles_ = outputs_[0].triangles();
         return;
     }
-    const size_t boxes = nodes + triangles / kBlockSize;
-    joined_ = memory_.take<Box3f>(boxes + triangles * sizeof(uint32_t) / sizeof(Box3f) + 1);
-    joined_boxes_ = {joined_.data(), nodes};
-    joined_part_boxes_ = {joined_.data() + nodes, triangles / kBlockSize};
-    joined_triangles_ = {reinterpret_cast<uint32_t*>(joined_.data() + boxes), triangles};
     parallel_for(threads_, subtrees_.size(), [&](size_t i) { copy(subtrees_[i], tree); });
     write_top(*top, 0, tree);
     for (const Subtree& subtree : subtrees_) {
         close_gaps(subtree, tree);
     }
-    boxes_ = {joined_boxes_, joined_part_boxes_};
-    triangles_ = joined_triangles_;
 }
 
 std::span<const Gap> Subtrees::gaps(const Subtree& subtree) const {
@@ -259,15 +251,21 @@ void Subtrees::place(Subtree& subtree, size_t& nodes, size_t& triangles) {
     subtree.triangle_place = triangles;
     size_t node = subtree.first_node;
     size_t triangle = subtree.first_triangle;
+    const auto place_up_to = [&](size_t node_end, size_t triangle_end) {
+        if (node != node_end) {
+            const SubtreeOutput& output = outputs_[static_cast<size_t>(subtree.worker)];
+            pieces_.push_back(output.piece(node, node_end, triangle, triangle_end, nodes, triangles / kBlockSize));
+        }
+        nodes += node_end - node;
+        triangles += triangle_end - triangle;
+        node = node_end;
+        triangle = triangle_end;
+    };
     for (const Gap& gap : gaps(subtree)) {
-        nodes += gap.node - node;
-        triangles += gap.triangle - triangle;
+        place_up_to(gap.node, gap.triangle);
         place(subtrees_[gap.subtree], nodes, triangles);
-        node = gap.node;
-        triangle = gap.triangle;
     }
-    nodes += subtree.node_end - node;
-    triangles += subtree.triangle_end - triangle;
+    place_up_to(subtree.node_end, subtree.triangle_end);
     subtree.place_end = nodes;
     subtree.triangle_place_end = triangles;
 }
@@ -278,6 +276,8 @@ void Subtrees::place(const TopLevels& top, uint32_t index, size_t& nodes, size_t
         place(*subtree, nodes, triangles);
         return;
     }
+    pieces_.push_back(
+        {static_cast<uint32_t>(nodes), static_cast<uint32_t>(triangles / kBlockSize), {&top_boxes_[index], 1}, {}, {}});
     ++nodes;
     place(top, top.nodes()[index].left, nodes, triangles);
     place(top, top.nodes()[index].right, nodes, triangles);
@@ -294,13 +294,13 @@ size_t Subtrees::place_of(const Subtree& subtree, size_t node) const {
     return place;
 }
 
-void Subtrees::copy(const Subtree& subtree, Tree& tree) {
+void Subtrees::copy(const Subtree& subtree, Tree& tree) const {
     const SubtreeOutput& output = outputs_[static_cast<size_t>(subtree.worker)];
     size_t node = subtree.first_node;
     size_t triangle = subtree.first_triangle;
     size_t place = subtree.place;
     size_t triangle_place = subtree.triangle_place;
-    const auto copy_up_to = [&](size_t node_end, size_t triangle_end) {
+    const auto copy_up_to = [&](size_t node_end) {
         for (size_t i = node; i < node_end; ++i) {
             const KdNode from = output.nodes()[i];
             KdNode& to = tree.nodes[place + i - node];
@@ -313,21 +313,15 @@ void Subtrees::copy(const Subtree& subtree, Tree& tree) {
                 to = KdNode::inner(from.axis(), from.split(), static_cast<uint32_t>(right_place));
             }
         }
-        const auto [boxes, part_boxes] = output.boxes();
-        std::copy_n(boxes.data() + node, node_end - node, joined_boxes_.data() + place);
-        std::copy_n(part_boxes.data() + triangle / kBlockSize, (triangle_end - triangle) / kBlockSize,
-                    joined_part_boxes_.data() + triangle_place / kBlockSize);
-        std::copy_n(output.triangles().data() + triangle, triangle_end - triangle,
-                    joined_triangles_.data() + triangle_place);
     };
     for (const Gap& gap : gaps(subtree)) {
-        copy_up_to(gap.node, gap.triangle);
+        copy_up_to(gap.node);
         place = subtrees_[gap.subtree].place_end;
         triangle_place = subtrees_[gap.subtree].triangle_place_end;
         node = gap.node;
         triangle = gap.triangle;
     }
-    copy_up_to(subtree.node_end, subtree.triangle_end);
+    copy_up_to(subtree.node_end);
 }
 
 void Subtrees::write_top(const TopLevels& top, uint32_t index, Tree& tree) {
@@ -339,9 +333,13 @@ void Subtrees::write_top(const TopLevels& top, uint32_t index, Tree& tree) {
     write_top(top, node.right, tree);
     const size_t right = top_places_[node.right];
     tree.nodes[top_places_[index]] = KdNode::inner(node.split.axis, node.split.position, static_cast<uint32_t>(right));
-    Box3f box = joined_boxes_[top_places_[node.left]];
-    box.extend(joined_boxes_[right]);
-    joined_boxes_[top_places_[index]] = box;
+    top_boxes_[index] = box(top_places_[node.left]);
+    top_boxes_[index].extend(box(right));
+}
+
+Box3f& Subtrees::box(size_t place) {
+    const auto node = static_cast<uint32_t>(place);
+    return piece_of(pieces_, node).box(node);
 }
 
 /// Links the subtrees that fill gaps, and adds their boxes to those above them.
@@ -361,9 +359,9 @@ void Subtrees::extend_boxes(const Tree& tree, size_t index, size_t last) {
     if (index != last) {
         extend_boxes(tree, last < right ? index + 1 : right, last);
     }
-    Box3f box = joined_boxes_[index + 1];
-    box.extend(joined_boxes_[right]);
-    joined_boxes_[index] = box;
+    Box3f both = box(index + 1);
+    both.extend(box(right));
+    box(index) = both;
 }
 
 }  // namespace espalier

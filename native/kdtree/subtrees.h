@@ -39,10 +39,8 @@ class Subtrees : public SubtreeSharing {
     /// for a whole tree.
     void compact(TopLevels* top, Tree& tree);
 
-    /// After compaction.
-    const TightBoxes& boxes() const { return boxes_; }
-    /// After compaction: kBlockSize face indices per block.
-    std::span<const uint32_t> triangles() const { return triangles_; }
+    /// After compaction: of the whole tree.
+    std::span<const TreePiece> pieces() const { return pieces_; }
 
     uint32_t give(const OpenNode& node, const References& references) override;
 
@@ -82,10 +80,11 @@ class Subtrees : public SubtreeSharing {
     std::span<const Gap> gaps(const Subtree& subtree) const;
     void place(Subtree& subtree, size_t& nodes, size_t& triangles);
     void place(const TopLevels& top, uint32_t index, size_t& nodes, size_t& triangles);
-    void copy(const Subtree& subtree, Tree& tree);
+    void copy(const Subtree& subtree, Tree& tree) const;
     void write_top(const TopLevels& top, uint32_t index, Tree& tree);
     void close_gaps(const Subtree& subtree, Tree& tree);
     void extend_boxes(const Tree& tree, size_t index, size_t last);
+    Box3f& box(size_t place);
     size_t place_of(const Subtree& subtree, size_t node) const;
 
     TransientMemory& memory_;
@@ -109,12 +108,8 @@ class Subtrees : public SubtreeSharing {
 
     std::vector<Subtree*> of_top_;    ///< per top node; null where the node is split
     std::vector<size_t> top_places_;  ///< per top node
-    LargeBuffer<Box3f> joined_;       ///< the boxes of nodes and parts, and the triangles
-    std::span<Box3f> joined_boxes_;
-    std::span<Box3f> joined_part_boxes_;
-    std::span<uint32_t> joined_triangles_;
-    TightBoxes boxes_;
-    std::span<const uint32_t> triangles_;
+    std::vector<Box3f> top_boxes_;    ///< likewise
+    std::vector<TreePiece> pieces_;
 };
 
 }  // namespace espalier
