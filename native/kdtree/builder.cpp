@@ -114,7 +114,7 @@ class Builder {
     void make_references_alone(Subtrees& subtrees) {
         const uint32_t triangles = soup_.size();
         ReferenceBuffer room(subtree_room(triangles), most_block_bytes(triangles), usual_block_bytes(triangles));
-        room.memory().take_pages(0, usual_block_bytes(triangles));
+        room.memory().take_pages(0, usual_block_bytes(triangles) / sizeof(uint32_t));
         const uint32_t count = build_kernels().make_references(soup_, 0, triangles, room.references(), tree_.bounds,
                                                                tree_.report.rejected_faces);
         subtrees.add_whole({tree_.bounds, tree_.bounds, count, spare_references(triangles), 0}, std::move(room));

@@ -17,6 +17,18 @@ namespace espalier {
 
 class TransientMemory;
 
+/// Takes the pages that begin among these items now, which costs half of what taking small ones at the first write to
+/// each does. A system that cannot will take them later.
+template <class T>
+void take_pages(T* begin, T* end) {
+    constexpr int kPopulateWrite = 23;  // MADV_POPULATE_WRITE, Linux 5.14
+    constexpr uintptr_t kPage = 4096;   // the smallest of any system
+    auto* first = reinterpret_cast<std::byte*>(begin) + (0 - reinterpret_cast<uintptr_t>(begin)) % kPage;
+    if (const auto* last = reinterpret_cast<std::byte*>(end); first < last) {
+        ::madvise(first, static_cast<size_t>(last - first), kPopulateWrite);
+    }
+}
+
 /// Room for `capacity` items straight from the operating system. Memory is taken only when it is first written, in huge
 /// pages where they pay: a fault costs several times what clearing its 4 KiB does. Items start as zero bytes.
 template <class T>
@@ -89,14 +101,8 @@ class LargeBuffer {
         return reused;
     }
 
-    /// Takes the pages of bytes [begin, end) now, which costs half of what taking small ones one by one does. A system
-    /// that cannot will take them later.
-    void take_pages(size_t begin, size_t end) {
-        end = std::min(end, bytes());
-        if (begin < end) {
-            ::madvise(reinterpret_cast<std::byte*>(data_) + begin, end - begin, kPopulateWrite);
-        }
-    }
+    /// Takes the pages of items [begin, end) now (see above).
+    void take_pages(size_t begin, size_t end) { espalier::take_pages(data_ + begin, data_ + std::min(end, capacity_)); }
 
     T* data() { return data_; }
     const T* data() const { return data_; }
@@ -110,7 +116,6 @@ class LargeBuffer {
     template <class U>
     friend class LargeBuffer;
     friend class TransientMemory;
-    static constexpr int kPopulateWrite = 23;          ///< MADV_POPULATE_WRITE, Linux 5.14
     static constexpr size_t kPage = size_t{64} << 10;  ///< the largest small page of any system
     /// From here on clearing the rest of a huge page costs no more than small pages do, and little memory is wasted.
     static constexpr size_t kHugePagesFrom = size_t{1536} << 10;

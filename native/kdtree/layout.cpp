@@ -300,6 +300,7 @@ void build_layout(const TriangleSoup& soup, std::span<const TreePiece> pieces, i
             return;
         }
         const BlockTask& task = block_tasks[i - runs.size()];
+        tree.blocks.take_pages(task.place, task.place + task.count);
         build_kernels().write_blocks(soup, classes, task.triangles, task.count, tree.blocks.data() + task.place);
     });
 
@@ -322,6 +323,7 @@ void build_layout(const TriangleSoup& soup, std::span<const TreePiece> pieces, i
     std::copy_n(top.data(), top.count(), tree.wide_nodes.data());
     parallel_for(threads, runs.size(), [&](size_t i) {
         const Run& run = runs[i];
+        tree.wide_nodes.take_pages(run.place, run.place + run.count);
         for (size_t n = 0; n < run.count; ++n) {
             WideNode& wide = tree.wide_nodes[run.place + n];
             wide = run.wide[n];

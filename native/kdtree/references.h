@@ -63,6 +63,8 @@ class ReferenceBuffer {
     }
     const References& references() const { return references_; }
     size_t capacity() const { return stride_ - kSlack; }
+    /// Of the memory, how much the references may take.
+    size_t words() const { return stride_ * kArrays; }
     LargeBuffer<uint32_t>& memory() { return memory_; }
     /// Gives the memory away.
     LargeBuffer<uint32_t> take_memory() {

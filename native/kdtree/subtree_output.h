@@ -58,8 +58,8 @@ class SubtreeOutput {
 
     /// Takes the place of an inner node, before its left child is written; returns its index.
     HWY_INLINE size_t open_inner() {
-        if (node_count_ == node_capacity_) {
-            reserve(2 * node_capacity_ + 64, triangle_capacity_);
+        if (node_count_ == node_limit_) {
+            make_node_room();
         }
         return node_count_++;
     }
@@ -87,11 +87,8 @@ class SubtreeOutput {
         const size_t index = open_inner();
         const size_t first = triangle_count_;
         const size_t room = size_t{block_count(references)} * kBlockSize;
-        if (first + room > triangle_capacity_) {
-            if (first / kBlockSize > kMaxBlocks) {
-                throw std::length_error("the tree needs more triangle blocks than its indices can count");
-            }
-            reserve(node_capacity_, 2 * (first + room));
+        if (first + room > triangle_limit_) {
+            make_triangle_room(first + room);
         }
         nodes_[index] = KdNode::leaf(static_cast<uint32_t>(first / kBlockSize), references);
         triangle_count_ += room;
@@ -113,7 +110,31 @@ class SubtreeOutput {
     }
 
  private:
-    HWY_NOINLINE void reserve(size_t nodes, size_t triangles, TransientMemory* transient = nullptr) {
+    // Pages are taken for so many nodes and triangles at a time.
+    static constexpr size_t kNodeStretch = 4096;
+    static constexpr size_t kTriangleStretch = 2048 * kBlockSize;
+
+    HWY_NOINLINE void make_node_room() {
+        if (node_count_ == node_capacity_) {
+            reserve(2 * node_capacity_ + 64, triangle_capacity_);
+        }
+        node_limit_ = std::min(node_capacity_, node_count_ + kNodeStretch);
+        take_pages(nodes_ + node_count_, nodes_ + node_limit_);
+        take_pages(boxes_ + node_count_, boxes_ + node_limit_);
+    }
+    HWY_NOINLINE void make_triangle_room(size_t end) {
+        if (end > triangle_capacity_) {
+            if (triangle_count_ / kBlockSize > kMaxBlocks) {
+                throw std::length_error("the tree needs more triangle blocks than its indices can count");
+            }
+            reserve(node_capacity_, 2 * end);
+        }
+        triangle_limit_ = std::min(triangle_capacity_, std::max(end, triangle_count_ + kTriangleStretch));
+        take_pages(triangles_ + triangle_count_, triangles_ + triangle_limit_);
+        take_pages(part_boxes_ + triangle_count_ / kBlockSize, part_boxes_ + triangle_limit_ / kBlockSize);
+    }
+
+    void reserve(size_t nodes, size_t triangles, TransientMemory* transient = nullptr) {
         const size_t blocks = triangles / kBlockSize;
         const size_t bytes =
             nodes * (sizeof(KdNode) + sizeof(Box3f)) + blocks * (kBlockSize * sizeof(uint32_t) + sizeof(Box3f));
@@ -134,7 +155,9 @@ class SubtreeOutput {
         part_boxes_ = new_part_boxes;
         triangles_ = new_triangles;
         node_capacity_ = nodes;
+        node_limit_ = node_count_;
         triangle_capacity_ = triangles;
+        triangle_limit_ = triangle_count_;
         memory_ = std::move(memory);
     }
 
@@ -145,7 +168,9 @@ class SubtreeOutput {
     size_t node_count_ = 0;
     size_t triangle_count_ = 0;
     size_t node_capacity_ = 0;
+    size_t node_limit_ = 0;  ///< for so many, pages have been taken
     size_t triangle_capacity_ = 0;
+    size_t triangle_limit_ = 0;  ///< likewise
     LargeBuffer<std::byte> memory_;
     std::vector<Gap> gaps_;
 };

@@ -230,6 +230,7 @@ void Subtrees::compact(TopLevels* top, Tree& tree) {
     tree.blocks = std::move(references).reuse_for<TriangleBlock>(triangles / kBlockSize);
     tree.nodes = LargeBuffer<KdNode>(nodes);
     if (is_whole) {
+        tree.nodes.take_pages(0, nodes);
         std::copy_n(outputs_[0].nodes().begin(), nodes, tree.nodes.data());
         return;
     }
@@ -301,6 +302,7 @@ void Subtrees::copy(const Subtree& subtree, Tree& tree) const {
     size_t place = subtree.place;
     size_t triangle_place = subtree.triangle_place;
     const auto copy_up_to = [&](size_t node_end) {
+        tree.nodes.take_pages(place, place + node_end - node);
         for (size_t i = node; i < node_end; ++i) {
             const KdNode from = output.nodes()[i];
             KdNode& to = tree.nodes[place + i - node];

@@ -58,10 +58,10 @@ void TopLevels::make_references() {
     const uint32_t triangles = soup_.size();
     const size_t count = (triangles + segment_size_ - 1) / segment_size_;
     // Every thread takes pages of its own: two that first wrote to one page at the same time would both clear it.
-    constexpr size_t kPages = LargeBuffer<uint32_t>::kHugePage;
-    const size_t bytes = usual_block_bytes(triangles);
-    parallel_for(threads_, bytes / kPages + 1,
-                 [&](size_t i) { memory_.first().memory().take_pages(i * kPages, std::min(bytes, (i + 1) * kPages)); });
+    constexpr size_t kPages = LargeBuffer<uint32_t>::kHugePage / sizeof(uint32_t);
+    const size_t usual = std::max(usual_block_bytes(triangles) / sizeof(uint32_t), memory_.first().words());
+    parallel_for(threads_, usual / kPages + 1,
+                 [&](size_t i) { memory_.first().memory().take_pages(i * kPages, std::min(usual, (i + 1) * kPages)); });
 
     if (is_large_ && sort_root()) {
         return;

@@ -20,7 +20,14 @@ class WideNodes {
     WideNodes(size_t capacity, size_t expected) : nodes_(capacity, expected * sizeof(WideNode)) {}
     WideNodes(size_t capacity, size_t expected, TransientMemory& memory)
         : nodes_(memory.take<WideNode>(capacity, expected * sizeof(WideNode))) {}
-    uint32_t add() { return count_++; }
+    uint32_t add() {
+        if (count_ == limit_) {
+            constexpr uint32_t kStretch = 256;
+            limit_ += kStretch;
+            nodes_.take_pages(count_, limit_);
+        }
+        return count_++;
+    }
     uint32_t count() const { return count_; }
     size_t capacity() const { return nodes_.size(); }
     WideNode* data() { return nodes_.data(); }
@@ -29,6 +36,7 @@ class WideNodes {
  private:
     LargeBuffer<WideNode> nodes_;
     uint32_t count_ = 0;
+    uint32_t limit_ = 0;  ///< for so many, pages have been taken
 };
 
 /// Surface area of a box, halved.
