@@ -130,7 +130,7 @@ class SubtreeBuilder {
         }
     }
 
-    /// For scenes whose every plane leaves nearly all references on one side, or on both.
+    /// For nodes that there is no room for: where every plane leaves nearly all references on one side, or on both.
     void build_elsewhere(const OpenNode& node, const References& references, size_t capacity) {
         const ReferenceBuffer buffer(capacity);
         copy_references(references, node.count, buffer.references());
@@ -145,7 +145,8 @@ class SubtreeBuilder {
         SubtreeBuilder(input, output_).build(node, input.begin, input.room);
     }
 
-    /// Splits several levels of a node at once; false if the sample has no plane for that.
+    /// Splits several levels of a node at once; false if the sample has no plane for that, or too much straddles its
+    /// planes.
     bool build_multiway(const OpenNode& node, size_t begin, size_t room) {
         if (room + node.count > room_end_) {
             build_elsewhere(node, at(begin), multiway_room(node.count));
@@ -186,7 +187,8 @@ class SubtreeBuilder {
             scratch_ = ReferenceBuffer(SortedChunk::kScratch, 0, 0);
         }
         const uint32_t count = sorted.node.count;
-        for (uint32_t first = 0; first < count; first += kChunk) {
+        uint64_t total = 0;  // what a sample that misleads may take is bounded
+        for (uint32_t first = 0; first < count && total <= count + sorted.node.spare; first += kChunk) {
             SortedChunk& chunk = sorted.chunks.emplace_back();
             chunk.places = at(room);
             const size_t used = HWY_NAMESPACE::sort_by_leaves(*input_.soup, sorted.split, at(begin + first),
@@ -196,6 +198,7 @@ class SubtreeBuilder {
                 return 0;
             }
             room += used;
+            total += chunk.total();
         }
         return room;
     }

@@ -1,6 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 #include "kdtree/multiway_split.h"
 
+#include <algorithm>
+#include <span>
+
 namespace espalier {
 
 bool SortedNode::add_up() {
@@ -17,6 +20,13 @@ bool SortedNode::add_up() {
 OpenNode SortedNode::leaf(uint32_t leaf, const Box3f& cell, int depth) const {
     const uint64_t rest = node.count + node.spare - std::max<uint64_t>(total_, node.count);
     return {cell, tight[leaf], count[leaf], count[leaf] == 0 ? 0 : rest * count[leaf] / total_, depth};
+}
+
+bool SortedNode::has_plane_in_upper_end() const {
+    const auto branches = std::span(split.branches).first(split.leaves - 1);
+    return std::any_of(branches.begin(), branches.end(), [&](const MultiwaySplit::Branch& branch) {
+        return branch.split.position == node.cell.upper[branch.split.axis];
+    });
 }
 
 uint32_t SortedNode::skip_planes_beside(const Box3f& cell, uint32_t child) const {

@@ -5,6 +5,7 @@
 #include <array>
 #include <bit>
 #include <cstdint>
+#include <numeric>
 #include <vector>
 
 #include "geometry/vec.h"
@@ -48,6 +49,8 @@ struct SortedChunk {
     std::array<uint32_t, MultiwaySplit::kMostLeaves> begin{};  ///< among the places
     std::array<uint32_t, MultiwaySplit::kMostLeaves> count{};
     std::array<Box3f, MultiwaySplit::kMostLeaves> tight{};
+
+    uint64_t total() const { return std::accumulate(count.begin(), count.end(), uint64_t{0}); }
 };
 
 /// A node whose references are sorted by the leaves of a multiway split, chunk by chunk.
@@ -62,8 +65,10 @@ struct SortedNode {
     bool add_up();
     /// What a leaf is, in a cell that the planes above it leave.
     OpenNode leaf(uint32_t leaf, const Box3f& cell, int depth) const;
-    /// The first below a child that cuts the cell: planes were chosen when only a sample was known, and some may have
-    /// nothing on one side.
+    /// Whether a plane lies in the upper end of the node's cell. What is flat in both went right of it.
+    bool has_plane_in_upper_end() const;
+    /// The first below a child that cuts the cell: when the planes of the root were chosen, its box was not known but
+    /// that of all vertices, and some planes may lie beside it. There must be none in its upper end.
     uint32_t skip_planes_beside(const Box3f& cell, uint32_t child) const;
     /// Copies a leaf's references into one piece.
     void gather(uint32_t leaf, const References& to) const;

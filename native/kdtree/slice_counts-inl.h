@@ -13,10 +13,8 @@
 
 #include <algorithm>
 #include <array>
-#include <bit>
 
 #include "kdtree/build_kernels.h"
-#include "kdtree/compress-inl.h"
 #include "kdtree/slices-inl.h"
 
 #if HWY_TARGET == HWY_AVX3_DL

@@ -239,6 +239,11 @@ void Subtrees::compact(TopLevels* top, Tree& tree) {
     for (const Subtree& subtree : subtrees_) {
         close_gaps(subtree, tree);
     }
+    for (const Subtree& subtree : subtrees_) {
+        for (const Gap& gap : gaps(subtree)) {
+            extend_boxes(tree, 0, place_of(subtree, gap.inner));
+        }
+    }
 }
 
 std::span<const Gap> Subtrees::gaps(const Subtree& subtree) const {
@@ -344,14 +349,13 @@ Box3f& Subtrees::box(size_t place) {
     return piece_of(pieces_, node).box(node);
 }
 
-/// Links the subtrees that fill gaps, and adds their boxes to those above them.
+/// Links the subtrees that fill gaps.
 void Subtrees::close_gaps(const Subtree& subtree, Tree& tree) {
     for (const Gap& gap : gaps(subtree)) {
         const size_t parent = place_of(subtree, gap.inner);
         const KdNode node = tree.nodes[parent];
         tree.nodes[parent] =
             KdNode::inner(node.axis(), node.split(), static_cast<uint32_t>(subtrees_[gap.subtree].place));
-        extend_boxes(tree, 0, parent);
     }
 }
 

@@ -13,7 +13,7 @@ namespace espalier {
 
 /// Phases 3 and 4: the subtrees below the top levels, and all nodes in their depth-first places. Threads take whole
 /// subtrees, the largest first; one that finds none left is given part of one that is still being built. Which thread
-/// builds what decides where it lies until phase 4, never what the tree is.
+/// builds what decides where its nodes lie until phase 4, and the rest until phase 5, never what the tree is.
 class Subtrees : public SubtreeSharing {
  public:
     /// memory: for what this needs itself; the references have their own.

@@ -90,26 +90,31 @@ void TopLevels::make_references() {
     nodes_.push_back(std::move(root));
 }
 
-/// False if a sample has no plane for that.
+/// False if a sample has no plane for that, or if so many faces straddle its planes that they are not worth it.
 bool TopLevels::sort_root() {
-    root_.split = choose_multiway_split();
-    if (root_.split.leaves == 1) {
-        return false;
-    }
-    sort_faces();
-    if (!root_.add_up()) {
+    for (Box3f bounds = bound_vertices();; bounds = root_.node.cell) {
         root_ = {};
         rejected_ = {};
-        return false;
+        root_.split = choose_multiway_split(bounds);
+        if (root_.split.leaves == 1) {
+            return false;
+        }
+        sort_faces();
+        if (!root_.add_up()) {
+            root_ = {};
+            rejected_ = {};
+            return false;
+        }
+        if (bounds == root_.node.cell || !root_.has_plane_in_upper_end()) {
+            break;  // or it is planned anew within the box of the faces, where no plane lies in its ends
+        }
     }
     add_nodes(root_.split.root, root_.node.cell, 0);
     return true;
 }
 
-MultiwaySplit TopLevels::choose_multiway_split() {
-    const uint32_t triangles = soup_.size();
-    const uint32_t shift = sampling_shift(triangles);
-    const ReferenceBuffer sample(sample_room((triangles >> shift) + kChunk));
+/// Larger than the box of the faces if some vertices have none, but known before they are.
+Box3f TopLevels::bound_vertices() const {
     constexpr size_t kVertices = 16384;
     const size_t vertices = soup_.positions.size() / 3;
     std::vector<Box3f> boxes((vertices + kVertices - 1) / kVertices);
@@ -120,6 +125,13 @@ MultiwaySplit TopLevels::choose_multiway_split() {
     for (const Box3f& box : boxes) {
         bounds.extend(box);
     }
+    return bounds;
+}
+
+MultiwaySplit TopLevels::choose_multiway_split(const Box3f& bounds) const {
+    const uint32_t triangles = soup_.size();
+    const uint32_t shift = sampling_shift(triangles);
+    const ReferenceBuffer sample(sample_room((triangles >> shift) + kChunk));
     // All threads together, each chunk where it would be if no face before it were faulty.
     const size_t chunks = (triangles + kChunk - 1) / kChunk;
     const uint32_t most = kChunk >> shift;
@@ -152,7 +164,11 @@ void TopLevels::sort_faces() {
     };
     std::vector<Worker> workers(static_cast<size_t>(threads_));
     root_.chunks.resize(count);
+    std::atomic<uint64_t> total{0};
     parallel_for(threads_, count, [&](size_t i, int number) {
+        if (total.load(std::memory_order_relaxed) > triangles + spare_references(triangles)) {
+            return;  // too many already: what a sample that misleads may take is bounded
+        }
         if (cancel_ != nullptr && cancel_->load(std::memory_order_relaxed)) {
             throw BuildCancelled();
         }
@@ -174,6 +190,7 @@ void TopLevels::sort_faces() {
             wanted = kernels_.sort_by_leaves(soup_, root_.split, made, valid, parameters_.clip,
                                              made.at(kChunk + SortedChunk::kMargin), worker.room, root_.chunks[i]);
             if (wanted <= worker.room) {
+                total.fetch_add(root_.chunks[i].total(), std::memory_order_relaxed);
                 worker.places = worker.places.at(wanted);
                 worker.room -= wanted;
                 return;

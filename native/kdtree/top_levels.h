@@ -81,7 +81,8 @@ class TopLevels {
         uint32_t segment;
     };
     bool sort_root();
-    MultiwaySplit choose_multiway_split();
+    Box3f bound_vertices() const;
+    MultiwaySplit choose_multiway_split(const Box3f& bounds) const;
     void sort_faces();
     uint32_t add_nodes(uint32_t child, const Box3f& cell, int depth);
     std::vector<Part> parts_of(const std::vector<uint32_t>& nodes) const;
