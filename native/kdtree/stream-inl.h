@@ -26,15 +26,25 @@ HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
 namespace hn = hwy::HWY_NAMESPACE;
 
-/// A ray under way with what it still has to visit, the nearest on top, and at the bottom the mark that nothing is
-/// left. 70 levels of wide nodes cover the deepest kd-tree, 48 levels if each opens but its siblings, and below it the
+/// What few rays have so much of that it does not fit into StreamRay: the lower part of what they still have to visit.
+/// 70 levels of wide nodes cover the deepest kd-tree, 48 levels if each opens but its siblings, and below it the
 /// longest leaf, kMaxBlocks halved until parts of kMaxLeafBlocks are left.
+struct Overflow {
+    static constexpr size_t kCapacity = 70 * (WideNode::kWidth - 1);
+    uint32_t children[kCapacity];
+    float depths[kCapacity];
+};
+
+/// A ray under way with what it still has to visit, the nearest on top, and at the bottom the mark that nothing is
+/// left. Small, since all rays in flight are in use at once: together they are to lie on few pages.
 struct StreamRay : TracedRay {
     static constexpr uint32_t kNothing = 0;  ///< the root, which is nobody's child
-    static constexpr size_t kCapacity = 70 * (WideNode::kWidth - 1) + 3 * WideNode::kWidth;
+    static constexpr size_t kFull = 40;      ///< with no more than these there is room for another node's children
+    static constexpr size_t kCapacity = kFull + 2 * WideNode::kWidth;  ///< vectors may run over the end
 
-    uint32_t number;  ///< among the rays
-    uint32_t next;    ///< where it goes: a child's code
+    uint32_t number;    ///< among the rays
+    uint32_t next;      ///< where it goes: a child's code
+    uint32_t overflow;  ///< how many wait in its Overflow
     uint32_t* top;
     uint32_t children[kCapacity];
     float depths[kCapacity];  ///< where the ray enters the child
@@ -45,6 +55,28 @@ struct StreamRay : TracedRay {
         children[0] = kNothing;
         depths[0] = -kInfinity;
         top = children + 1;
+        overflow = 0;
+    }
+
+    HWY_INLINE bool is_full() const { return top > children + kFull; }
+
+    /// Moves all but the mark there.
+    HWY_NOINLINE void spill(Overflow& below) {
+        const auto count = static_cast<size_t>(top - children) - 1;
+        std::copy_n(children + 1, count, below.children + overflow);
+        std::copy_n(depths + 1, count, below.depths + overflow);
+        overflow += static_cast<uint32_t>(count);
+        top = children + 1;
+    }
+
+    /// Takes the nearest from there, of which there are some, onto an empty stack whose mark was taken off.
+    HWY_NOINLINE void refill(const Overflow& below) {
+        const uint32_t count = std::min<uint32_t>(overflow, kFull / 2);
+        overflow -= count;
+        std::copy_n(below.children + overflow, count, children + 1);
+        std::copy_n(below.depths + overflow, count, depths + 1);
+        top = children + 1 + count;
+        prune();
     }
 
     /// Drops what lies beyond the ray's reach.
@@ -139,6 +171,9 @@ class Stream {
             const uint32_t nodes = std::exchange(lists.at_node, 0);
             for (uint32_t i = 0; i < nodes; ++i) {
                 StreamRay& ray = *node_list_[i];
+                if (ray.is_full()) [[unlikely]] {
+                    ray.spill(overflow_[&ray - ray_]);
+                }
                 visit_node(ray, nodes_[ray.next]);
                 go_on(ray, *--ray.top, lists);
             }
@@ -169,6 +204,7 @@ class Stream {
                 StreamRay& ray = *met.ray;
                 if (take(ray, met)) {
                     if constexpr (kAnyHit) {
+                        ray.overflow = 0;
                         end_list_[lists.at_end++] = &ray;
                         continue;
                     } else {
@@ -179,8 +215,14 @@ class Stream {
             }
             const uint32_t ended = std::exchange(lists.at_end, 0);
             for (uint32_t i = 0; i < ended; ++i) {
-                done(*end_list_[i]);
-                begin(*end_list_[i], lists);
+                StreamRay& ray = *end_list_[i];
+                if (ray.overflow != 0) [[unlikely]] {
+                    ray.refill(overflow_[&ray - ray_]);
+                    go_on(ray, *--ray.top, lists);
+                    continue;
+                }
+                done(ray);
+                begin(ray, lists);
             }
         }
     }
@@ -337,6 +379,7 @@ class Stream {
     StreamRay* end_list_[kInFlight + 1];
     Meeting meetings_[kInFlight];
     StreamRay ray_[kInFlight];
+    Overflow overflow_[kInFlight];
 };
 
 }  // namespace espalier::HWY_NAMESPACE

@@ -274,6 +274,18 @@ TEST(Traversal, RemembersAllThatWaits) {
     }
     occluded(tree, rays, blocked);
     EXPECT_EQ(std::count(blocked.begin(), blocked.end(), 1), static_cast<long>(rays.size()));
+
+    // And so is each of the others, for rays that begin before it.
+    rays.clear();
+    for (uint32_t i = 0; i < kLevels * (WideNode::kWidth - 1); ++i) {
+        const float t_min = 0.5F + static_cast<float>(i * kBlockSize);
+        rays.push_back({{0, 0.001F * static_cast<float>(i % 100), 0}, t_min, {0, 0, 1}, INFINITY});
+    }
+    hits.resize(rays.size());
+    intersect(tree, rays, hits);
+    for (uint32_t i = 0; i < rays.size(); ++i) {
+        EXPECT_EQ(hits[i].triangle, static_cast<int32_t>(i * kBlockSize));
+    }
 }
 
 /// The path that exactness is priced against takes the same way, and is only seldom wrong.
