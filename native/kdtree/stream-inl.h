@@ -179,19 +179,19 @@ class Stream {
             }
             // Whether a ray meets something in a leaf cannot be foreseen: those that may are listed, and looked at
             // together.
-            const uint32_t leaves = std::exchange(lists.at_leaf, 0);
+            const uint32_t leaves = ask_first(std::exchange(lists.at_leaf, 0), lists);
             uint32_t meeting = 0;
             for (uint32_t i = 0; i < leaves; ++i) {
-                StreamRay& ray = *leaf_list_[i];
-                const uint32_t leaf = ray.next;
+                StreamRay& ray = kAsksFirst ? *asked_list_[i] : *leaf_list_[i];
+                const uint32_t leaf = kAsksFirst ? asked_leaf_[i] : ray.next;
                 if (WideNode::is_unopened(leaf)) [[unlikely]] {
                     go_on(ray, on_demand_->open(leaf), lists);
                     continue;
                 }
                 const uint32_t further = leaf % WideNode::kMaxLeafBlocks;  // blocks behind the first
                 Meeting& met = meetings_[meeting];
-                const uint32_t possible = test_blocks<kExact>(ray, blocks_ + WideNode::first_block(leaf),
-                                                              at_most_one(further), batch_.least_inside(), met.verdict);
+                const uint32_t possible =
+                    test_blocks<kExact>(ray, blocks_ + WideNode::first_block(leaf), at_most_one(further), met.verdict);
                 met.ray = &ray;
                 met.leaf = leaf;
                 met.possible = possible;
@@ -277,6 +277,29 @@ class Stream {
             batch_.set_up(filled_up);
         }
         return true;
+    }
+
+    /// Where rays are asked first, lets so many from the list of those at a leaf go on that meet nothing there, and
+    /// lists the others anew. Returns the number of rays whose step at a leaf is still to be made.
+    HWY_INLINE uint32_t ask_first(uint32_t leaves, Lists& lists) {
+        if constexpr (!kAsksFirst) {
+            return leaves;
+        }
+        uint32_t left = 0;
+        for (uint32_t i = 0; i < leaves; ++i) {
+            StreamRay& ray = *leaf_list_[i];
+            const uint32_t leaf = ray.next;
+            asked_list_[left] = &ray;
+            asked_leaf_[left] = leaf;
+            uint32_t meets = 1;
+            if (!WideNode::is_unopened(leaf)) [[likely]] {
+                meets = at_most_one(
+                    lanes_in_question<kExact>(ray, blocks_[WideNode::first_block(leaf)], batch_.least_inside()));
+                leave(ray, leaf, lists, 1 - meets);
+            }
+            left += meets;
+        }
+        return left;
     }
 
     /// Goes on after a step at a leaf, if `counts` is 1.
@@ -376,6 +399,8 @@ class Stream {
     uint32_t end_ = 0;
     StreamRay* node_list_[kInFlight + 1];
     StreamRay* leaf_list_[kInFlight + 1];
+    StreamRay* asked_list_[kInFlight];  ///< and may meet something
+    uint32_t asked_leaf_[kInFlight];    ///< there
     StreamRay* end_list_[kInFlight + 1];
     Meeting meetings_[kInFlight];
     StreamRay ray_[kInFlight];

@@ -25,8 +25,8 @@ namespace hn = hwy::HWY_NAMESPACE;
 /// Blocks that one step tests: as many as fill a register.
 constexpr uint32_t kBlocksPerStep = hn::MaxLanes(hn::CappedTag<float, 2 * kBlockSize>()) == 2 * kBlockSize ? 2 : 1;
 
-/// Whether a step asks first if the ray may meet any of the triangles at all. Of two blocks it does about half of the
-/// time, and to guess that wrong costs more than the rest of the test.
+/// Whether rays are first asked if they may meet any of the triangles at all. Of one block they do in a quarter of the
+/// steps, of two in half of them, which saves less than it costs.
 constexpr bool kAsksFirst = kBlocksPerStep == 1;
 
 /// What the float test says of the lanes it does not rule out. Lanes of a second block follow those of the first.
@@ -66,6 +66,19 @@ struct ShearedRay {
     V sx, sy;
     V slant;
 };
+
+template <class D>
+HWY_INLINE ShearedRay<hn::Vec<D>> sheared_for_all(D d, const TracedRay& ray) {
+    return {ray.x,
+            ray.y,
+            ray.z,
+            hn::Set(d, ray.ox),
+            hn::Set(d, ray.oy),
+            hn::Set(d, ray.oz),
+            hn::Set(d, ray.sx),
+            hn::Set(d, ray.sy),
+            hn::Set(d, ray.slant)};
+}
 
 /// Triangles as a ray sees them, along +z through the origin, and their edge functions: the weights of the corners.
 template <class V>
@@ -151,6 +164,26 @@ HWY_INLINE DepthRange<V> depth_range(const V (&side)[3], V bound, V mz, V z0, V 
             hn::IfThenElse(is_sound, hn::Add(depth, error), hn::Set(d, kInfinity)), is_sound};
 }
 
+/// The lanes of a block that the ray may hit, by whatever depth, and others that come near; least_inside_of_class: as
+/// RayBatch has it.
+template <bool kExact>
+HWY_INLINE uint32_t lanes_in_question(const TracedRay& ray, const TriangleBlock& block,
+                                      const float* least_inside_of_class) {
+    const hn::CappedTag<float, kBlockSize> d;
+    constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<float, kBlockSize>());
+    using V = hn::Vec<decltype(d)>;
+    const ShearedRay<V> sheared = sheared_for_all(d, ray);
+    const V least_inside = kExact ? hn::Set(d, least_inside_of_class[block.triangle[0] / kMaxTriangles]) : hn::Zero(d);
+    uint32_t lanes = 0;
+    for (size_t first = 0; first < kBlockSize; first += kLanes) {
+        const Sheared<V> seen(sheared,
+                              [&](size_t k, uint32_t axis) { return hn::Load(d, block.vertex[k][0] + first + axis); });
+        // Lanes without a triangle are NaN and fail.
+        lanes |= mask_bits(d, hn::Ge(depth_inside(seen.side), least_inside)) << first;
+    }
+    return lanes;
+}
+
 /// The lanes of a block, and of the one behind it where a step takes two, that the ray may hit within [start, reach];
 /// every lane that it does hit is among them.
 ///
@@ -162,32 +195,18 @@ HWY_INLINE DepthRange<V> depth_range(const V (&side)[3], V bound, V mz, V z0, V 
 /// operations only leave roundings out. Underflow adds less than kTiny: a product's is below 2^-149, and a coordinate's
 /// counts by at most 2^-149 s, which u s^2 outweighs from s = 2^-125 on.
 template <bool kExact>
-HWY_INLINE uint32_t test_blocks(const TracedRay& ray, const TriangleBlock* block, uint32_t second,
-                                const float* least_inside_of_class, Verdict& verdict) {
+HWY_INLINE uint32_t test_blocks(const TracedRay& ray, const TriangleBlock* block, uint32_t second, Verdict& verdict) {
     const hn::CappedTag<float, kBlocksPerStep * kBlockSize> d;
     constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<float, kBlocksPerStep * kBlockSize>());
     using V = hn::Vec<decltype(d)>;
     const BlockLoader load(block, second);
-    const ShearedRay<V> sheared{ray.x,
-                                ray.y,
-                                ray.z,
-                                hn::Set(d, ray.ox),
-                                hn::Set(d, ray.oy),
-                                hn::Set(d, ray.oz),
-                                hn::Set(d, ray.sx),
-                                hn::Set(d, ray.sy),
-                                hn::Set(d, ray.slant)};
-    const V least_inside =
-        kAsksFirst && kExact ? hn::Set(d, least_inside_of_class[block->triangle[0] / kMaxTriangles]) : hn::Zero(d);
+    const ShearedRay<V> sheared = sheared_for_all(d, ray);
     uint32_t possible = 0;
     uint32_t certain = 0;
     for (size_t first = 0; first < kBlockSize; first += kLanes) {
         const Sheared<V> seen(sheared,
                               [&](size_t k, uint32_t axis) { return load(k * 3 * kBlockSize + first + axis); });
         const V inwards = depth_inside(seen.side);  // lanes without a triangle are NaN and fail
-        if (kAsksFirst && hn::AllFalse(d, hn::Ge(inwards, least_inside))) {
-            continue;
-        }
         V below = hn::Zero(d);
         V mz = below;
         if constexpr (kExact) {

@@ -119,22 +119,13 @@ inline FilterResult filter(const Ray& ray, const Vec3f (&corner)[3], const Box3f
     const TracedRay traced = set_up(ray, batch);
     const hn::CappedTag<float, kBlockSize> d;
     using V = hn::Vec<decltype(d)>;
-    const ShearedRay<V> own{traced.x,
-                            traced.y,
-                            traced.z,
-                            hn::Set(d, traced.ox),
-                            hn::Set(d, traced.oy),
-                            hn::Set(d, traced.oz),
-                            hn::Set(d, traced.sx),
-                            hn::Set(d, traced.sy),
-                            hn::Set(d, traced.slant)};
+    const ShearedRay<V> own = sheared_for_all(d, traced);
     const Sheared<V> seen(own, [&](size_t k, uint32_t axis) { return hn::Load(d, block.vertex[k][0] + axis); });
     const V bound = hn::Neg(seen.minus_edge_error(own.slant, largest_of(seen.z)));
     Verdict verdict{};
     constexpr bool kTwo = kBlocksPerStep == 2;
     constexpr uint32_t kLane = kTwo ? kBlockSize : 0;
-    const uint32_t possible =
-        test_blocks<true>(traced, blocks + (kTwo ? 0 : 1), kTwo ? 1 : 0, batch.least_inside(), verdict);
+    const uint32_t possible = test_blocks<true>(traced, blocks + (kTwo ? 0 : 1), kTwo ? 1 : 0, verdict);
     return {{hn::GetLane(seen.side[0]), hn::GetLane(seen.side[1]), hn::GetLane(seen.side[2])},
             hn::GetLane(bound),
             batch.least_inside()[size_class],
