@@ -11,6 +11,7 @@
 #include <hwy/highway.h>
 
 #include "geometry/triangle.h"
+#include "kdtree/box_union-inl.h"
 #include "kdtree/build_kernels.h"
 
 HWY_BEFORE_NAMESPACE();
@@ -56,8 +57,7 @@ inline uint32_t make_references(const TriangleSoup& soup, uint32_t begin, uint32
     const uint32_t lanes = static_cast<uint32_t>(hn::Lanes(df));
     const auto zero = hn::Zero(df);
     const auto limit = hn::Set(df, kMaxCoordinate);
-    F lowest[3] = {hn::Inf(df), hn::Inf(df), hn::Inf(df)};
-    F highest[3] = {hn::Neg(hn::Inf(df)), hn::Neg(hn::Inf(df)), hn::Neg(hn::Inf(df))};
+    BoxUnion seen(df);
     uint32_t count = 0;
     uint32_t triangle = begin;
     for (; triangle + lanes <= end; triangle += lanes) {
@@ -89,13 +89,13 @@ inline uint32_t make_references(const TriangleSoup& soup, uint32_t begin, uint32
             }
             continue;
         }
-        for (size_t axis = 0; axis < 3; ++axis) {
-            const auto low = hn::Min(v[0][axis], hn::Min(v[1][axis], v[2][axis]));
-            const auto high = hn::Max(v[0][axis], hn::Max(v[1][axis], v[2][axis]));
-            hn::StoreU(low, df, out.lower[axis] + count);
-            hn::StoreU(high, df, out.upper[axis] + count);
-            lowest[axis] = hn::Min(lowest[axis], low);
-            highest[axis] = hn::Max(highest[axis], high);
+        for (int axis = 0; axis < 3; ++axis) {
+            const auto a = static_cast<size_t>(axis);
+            const auto low = hn::Min(v[0][a], hn::Min(v[1][a], v[2][a]));
+            const auto high = hn::Max(v[0][a], hn::Max(v[1][a], v[2][a]));
+            hn::StoreU(low, df, out.lower[a] + count);
+            hn::StoreU(high, df, out.upper[a] + count);
+            seen.extend(axis, low, high);
         }
         hn::StoreU(hn::Iota(du, triangle), du, out.triangle + count);
         count += lanes;
@@ -107,12 +107,7 @@ inline uint32_t make_references(const TriangleSoup& soup, uint32_t begin, uint32
             bounds.extend(out.box(at));
         }
     }
-    Box3f seen;
-    for (int axis = 0; axis < 3; ++axis) {
-        seen.lower[axis] = hn::GetLane(hn::MinOfLanes(df, lowest[axis]));
-        seen.upper[axis] = hn::GetLane(hn::MaxOfLanes(df, highest[axis]));
-    }
-    bounds.extend(seen);
+    bounds.extend(seen.box());
     return count;
 }
 
@@ -121,8 +116,7 @@ inline Box3f bound_vertices(const TriangleSoup& soup, size_t begin, size_t end) 
     const hn::ScalableTag<float> d;
     constexpr size_t kLanes = hn::MaxLanes(hn::ScalableTag<float>());
     const auto limit = hn::Set(d, kMaxCoordinate);
-    hn::Vec<decltype(d)> lowest[3] = {hn::Inf(d), hn::Inf(d), hn::Inf(d)};
-    hn::Vec<decltype(d)> highest[3] = {hn::Neg(hn::Inf(d)), hn::Neg(hn::Inf(d)), hn::Neg(hn::Inf(d))};
+    BoxUnion seen(d);
     Box3f box;
     size_t vertex = begin;
     for (; vertex + kLanes <= end; vertex += kLanes) {
@@ -131,22 +125,16 @@ inline Box3f bound_vertices(const TriangleSoup& soup, size_t begin, size_t end) 
         auto valid = hn::Le(hn::Abs(v[0]), limit);
         valid = hn::And(valid, hn::And(hn::Le(hn::Abs(v[1]), limit), hn::Le(hn::Abs(v[2]), limit)));
         for (int axis = 0; axis < 3; ++axis) {
-            lowest[axis] = hn::IfThenElse(valid, hn::Min(lowest[axis], v[axis]), lowest[axis]);
-            highest[axis] = hn::IfThenElse(valid, hn::Max(highest[axis], v[axis]), highest[axis]);
+            seen.extend(axis, valid, v[axis], v[axis]);
         }
     }
     for (; vertex < end; ++vertex) {
         const float* v = soup.positions.data() + 3 * vertex;
         if (std::abs(v[0]) <= kMaxCoordinate && std::abs(v[1]) <= kMaxCoordinate && std::abs(v[2]) <= kMaxCoordinate) {
-            box.extend(Box3f{{v[0], v[1], v[2]}, {v[0], v[1], v[2]}});
+            box.extend(Vec3f{v[0], v[1], v[2]});
         }
     }
-    Box3f seen;
-    for (int axis = 0; axis < 3; ++axis) {
-        seen.lower[axis] = hn::GetLane(hn::MinOfLanes(d, lowest[axis]));
-        seen.upper[axis] = hn::GetLane(hn::MaxOfLanes(d, highest[axis]));
-    }
-    box.extend(seen);
+    box.extend(seen.box());
     return box;
 }
 

@@ -211,9 +211,7 @@ class SubtreeBuilder {
             return;
         }
         const MultiwaySplit::Branch& branch = sorted.split.branch(child);
-        Box3f left = cell;
-        Box3f right = cell;
-        left.upper[branch.split.axis] = right.lower[branch.split.axis] = branch.split.position;
+        const auto [left, right] = halves(cell, branch.split);
         const size_t index = output_.open_inner();
         build_below(sorted, rooms, branch.child[0], left, depth + 1);
         const size_t right_child = output_.node_count();

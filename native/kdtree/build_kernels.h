@@ -4,6 +4,7 @@
 #include <hwy/base.h>
 
 #include <atomic>
+#include <utility>
 
 #include "kdtree/multiway_split.h"
 #include "kdtree/open_node.h"
@@ -133,7 +134,7 @@ struct BuildKernels {
     MultiwaySplit (*choose_multiway_split)(const TriangleSoup& soup, const OpenNode& node, const References& sample,
                                            uint32_t count, const BuildParameters& parameters);
     /// Sorts a chunk of a node's references by leaves into its places; those on both sides of a plane go to both,
-    /// behind the others. Returns how many places that takes, and does nothing if they are more than `capacity`.
+    /// behind the others. Returns how many places that takes, and writes to none if they are more than `capacity`.
     size_t (*sort_by_leaves)(const TriangleSoup& soup, const MultiwaySplit& split, const References& chunk,
                              uint32_t count, bool clip, const References& scratch, size_t capacity,
                              SortedChunk& sorted);
@@ -184,13 +185,20 @@ HWY_INLINE bool finer_range(const OpenNode& node, Split split, Interval& range) 
     return lower < split.position && split.position < upper;
 }
 
+/// What a split leaves of a cell on both sides.
+HWY_INLINE std::pair<Box3f, Box3f> halves(const Box3f& cell, Split split) {
+    std::pair<Box3f, Box3f> made(cell, cell);
+    made.first.upper[split.axis] = split.position;
+    made.second.lower[split.axis] = split.position;
+    return made;
+}
+
 /// The two nodes that a split makes of one.
 HWY_INLINE void open_children(const OpenNode& parent, Split split, const Partition& parts, OpenNode& left,
                               OpenNode& right) {
-    left = {parent.cell, parts.left_tight, parts.left_count, 0, parent.depth + 1};
-    right = {parent.cell, parts.right_tight, parts.right_count, 0, parent.depth + 1};
-    left.cell.upper[split.axis] = split.position;
-    right.cell.lower[split.axis] = split.position;
+    const auto [left_cell, right_cell] = halves(parent.cell, split);
+    left = {left_cell, parts.left_tight, parts.left_count, 0, parent.depth + 1};
+    right = {right_cell, parts.right_tight, parts.right_count, 0, parent.depth + 1};
     share_spare(parent, left, right);
 }
 

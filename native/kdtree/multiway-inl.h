@@ -265,17 +265,17 @@ inline size_t sort_by_leaves(const TriangleSoup& soup, const MultiwaySplit& plan
                              SortedChunk& sorted) {
     constexpr uint32_t kMargin = SortedChunk::kMargin;
     alignas(64) uint8_t leaves[kChunk + 128];
-    struct Pieces {
+    struct Straddling {
         References references;
         uint32_t count = 0;
     };
-    std::array<Pieces, MultiwaySplit::kMostLeaves> pieces;
-    pieces[0] = {scratch, find_leaves(plan, chunk, count, leaves, scratch, sorted.places)};
-    uint32_t used = pieces[0].count + kMargin;
+    std::array<Straddling, MultiwaySplit::kMostLeaves> straddling;  // by the leaf in which they are so far
+    straddling[0] = {scratch, find_leaves(plan, chunk, count, leaves, scratch, sorted.places)};
+    uint32_t used = straddling[0].count + kMargin;
     for (uint32_t b = 0; b + 1 < plan.leaves; ++b) {
         const MultiwaySplit::Branch& branch = plan.branches[b];
-        if (Pieces& left = pieces[branch.leaf]; left.count != 0) {
-            Pieces& right = pieces[b + 1];
+        if (Straddling& left = straddling[branch.leaf]; left.count != 0) {
+            Straddling& right = straddling[b + 1];
             right.references = scratch.at(used);
             const Partition parts =
                 partition(soup, left.references, left.count, branch.split, clip, left.references, right.references);
@@ -289,7 +289,7 @@ inline size_t sort_by_leaves(const TriangleSoup& soup, const MultiwaySplit& plan
     for (uint32_t leaf = 0; leaf < plan.leaves; ++leaf) {
         const uint32_t whole = count_equal(leaves, count, static_cast<uint8_t>(leaf));
         sorted.begin[leaf] = places[leaf] = next;
-        sorted.count[leaf] = whole + pieces[leaf].count;
+        sorted.count[leaf] = whole + straddling[leaf].count;
         next += sorted.count[leaf] + kMargin;
     }
     if (next > capacity) {
@@ -298,7 +298,7 @@ inline size_t sort_by_leaves(const TriangleSoup& soup, const MultiwaySplit& plan
     const References& out = sorted.places;
     copy_to_leaves(chunk, count, leaves, out, places);
     for (uint32_t leaf = 0; leaf < plan.leaves; ++leaf) {
-        copy_references(pieces[leaf].references, pieces[leaf].count, out.at(places[leaf]));
+        copy_references(straddling[leaf].references, straddling[leaf].count, out.at(places[leaf]));
         sorted.tight[leaf] = bounds(out.at(sorted.begin[leaf]), sorted.count[leaf]);
     }
     return next;

@@ -48,7 +48,7 @@ void OnDemand::split_top(Tree& tree) {
     if (top_.nodes()[0].node.count == 0) {
         return;
     }
-    // From then on one node for each thread will do.
+    // From then on one node for each thread will do; a large scene has them already.
     top_.split_above(soup_.size() / static_cast<uint32_t>(threads_));
     // Only what is written takes memory. Inner nodes have two children at least, so there are no more of them.
     const size_t usual = usual_block_bytes(soup_.size());

@@ -28,9 +28,9 @@ class Subtrees : public SubtreeSharing {
 
     /// One subtree that is the whole tree, built where its references lie.
     void add_whole(const OpenNode& root, ReferenceBuffer references);
-    /// The same, its references sorted by the leaves of a multiway split.
+    /// One subtree that is the whole tree, of references sorted by the leaves of a multiway split.
     void add_sorted(TopLevels& top);
-    /// A subtree for each node that the top levels left unsplit, its references in one piece.
+    /// A subtree for each node that the top levels left unsplit.
     void add_below(TopLevels& top);
 
     /// Phase 3.

@@ -223,9 +223,7 @@ uint32_t TopLevels::add_nodes(uint32_t child, const Box3f& cell, int depth) {
         return index;
     }
     const MultiwaySplit::Branch& branch = root_.split.branch(child);
-    Box3f left_cell = cell;
-    Box3f right_cell = cell;
-    left_cell.upper[branch.split.axis] = right_cell.lower[branch.split.axis] = branch.split.position;
+    const auto [left_cell, right_cell] = halves(cell, branch.split);
     const uint32_t left = add_nodes(branch.child[0], left_cell, depth + 1);
     const uint32_t right = add_nodes(branch.child[1], right_cell, depth + 1);
     TopNode& node = nodes_[index];
