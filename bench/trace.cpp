@@ -257,14 +257,15 @@ void draw_tile(const Mesh& mesh, const Pinhole& camera, float offset, int x0, in
     }
 }
 
-template <class NewBatch>
-void draw(const Mesh& mesh, float offset, int threads, const NewBatch& new_batch, std::vector<float>& picture) {
+/// Every thread has two copies of a batch of its own.
+template <class Batch>
+void draw(const Mesh& mesh, float offset, int threads, const Batch& batch, std::vector<float>& picture) {
     constexpr int kAcross = kPicture / kTile;
     constexpr size_t kFar = 16;
     const Pinhole camera(mesh.view);
-    parallel_for(threads, size_t{kAcross} * kAcross, [&](size_t i) {
-        auto eye = new_batch();
-        auto light = new_batch();
+    std::vector<std::array<Batch, 2>> of_thread(static_cast<size_t>(threads), {batch, batch});
+    parallel_for(threads, size_t{kAcross} * kAcross, [&](size_t i, int worker) {
+        auto& [eye, light] = of_thread[static_cast<size_t>(worker)];
         // Tiles far apart, so that threads that open subtrees do not wait for one another.
         const auto tile = static_cast<int>(i % kFar * (size_t{kAcross} * kAcross / kFar) + i / kFar);
         draw_tile(mesh, camera, offset, tile % kAcross * kTile, tile / kAcross * kTile, eye, light, picture);
@@ -307,7 +308,7 @@ Json compare_previews(const Mesh& mesh, int threads, double seconds) {
                     const Tree tree = build(mesh.soup(), {.quality = mode.quality,
                                                           .threads = threads,
                                                           .on_demand_from = on_demand ? kOnDemandPays : UINT32_MAX});
-                    draw(mesh, offset, threads, [&] { return OurBatch(tree); }, ours);
+                    draw(mesh, offset, threads, OurBatch(tree), ours);
                     return watch.ms();
                 });
         }
@@ -316,9 +317,8 @@ Json compare_previews(const Mesh& mesh, int threads, double seconds) {
         malloc_trim(0);
         const Stopwatch watch;
         const EmbreeScene scene = build_embree(device, mesh.soup(), kMedium);
-        with_native_width(device.get(), [&](auto width) {
-            draw(mesh, offset, threads, [&] { return EmbreeBatch<width>(scene.get()); }, theirs);
-        });
+        with_native_width(device.get(),
+                          [&](auto width) { draw(mesh, offset, threads, EmbreeBatch<width>(scene.get()), theirs); });
         return watch.ms();
     });
     take_turns(contestants, seconds);
