@@ -200,18 +200,15 @@ class FinishQueue {
         : blocks_(blocks), rays_(rays), hits_(hits) {}
 
     HWY_INLINE void add(uint32_t ray, uint32_t place) {
-        if (place == kNoPlace) {
-            hits_[ray] = missed(rays_[ray]);
-            return;
-        }
-        // Not as soon as it is full: what was just written lane by lane cannot be read as a vector at once.
+        // Whether a ray has hit cannot be foreseen: all are written down as having missed, and those that have hit
+        // listed.
+        hits_[ray] = missed(rays_[ray]);
+        ray_[count_] = ray;
+        place_[count_] = place;
+        count_ += place != kNoPlace ? 1 : 0;
         if (count_ == FinishBatch::kSize) {
             flush();
         }
-        batch_.put_ray(count_, rays_[ray], blocks_, place);
-        ray_[count_] = ray;
-        place_[count_] = place;
-        ++count_;
     }
 
     /// The packet's rays, from number `first` on.
@@ -239,8 +236,9 @@ class FinishQueue {
         if (count_ == 0) {
             return;
         }
-        for (size_t lane = count_; lane < FinishBatch::kSize; ++lane) {
-            batch_.put_ray(lane, rays_[ray_[0]], blocks_, place_[0]);
+        for (size_t lane = 0; lane < FinishBatch::kSize; ++lane) {
+            const size_t i = lane < count_ ? lane : 0;
+            batch_.put_ray(lane, rays_[ray_[i]], blocks_, place_[i]);
         }
         const uint32_t open = batch_.finish<Number>();
         for (size_t i = 0; i < count_; ++i) {

@@ -153,6 +153,7 @@ class Stream {
         : nodes_(tree.wide_nodes.data()),
           blocks_(tree.blocks.data()),
           on_demand_(tree.on_demand.get()),
+          fetches_(tree.wide_nodes.bytes() + tree.blocks.bytes() > kCached),
           rays_(rays),
           batch_(tree.bounds) {}
 
@@ -175,6 +176,11 @@ class Stream {
                     ray.spill(overflow_[&ray - ray_]);
                 }
                 visit_node(ray, nodes_[ray.next]);
+            }
+            // In a loop of its own: what a node has put on a stack is long in coming, and while one ray waited for it,
+            // a processor could look ahead to no more than a few others.
+            for (uint32_t i = 0; i < nodes; ++i) {
+                StreamRay& ray = *node_list_[i];
                 go_on(ray, *--ray.top, lists);
             }
             // Whether a ray meets something in a leaf cannot be foreseen: those that may are listed, and looked at
@@ -228,7 +234,12 @@ class Stream {
     }
 
  private:
-    static constexpr uint32_t kInFlight = 32;
+    /// So many that, with what is noted of them, they fit into a processor's first cache of 32 KiB.
+    static constexpr uint32_t kInFlight = 24;
+    /// Bytes of nodes and blocks that processors keep so near that fetching ahead costs more than it gains.
+    static constexpr size_t kCached = size_t{10} << 20;
+    /// Of 64 bytes, from where a ray goes on. A node has four, a block five.
+    static constexpr int kLinesFetched = kBlocksPerStep == 2 ? 8 : 5;
 
     /// How many rays are on each list. Not beside the lists: what is written to those and to rays might be these, for
     /// all a compiler knows, and they would be read back at every step.
@@ -314,8 +325,8 @@ class Stream {
         go_on(ray, rest ^ ((rest ^ top) & (0U - is_last)), lists, counts);
     }
 
-    /// Puts a ray on the list of what it does next, if `counts` is 1, and has the memory for that fetched, without a
-    /// branch on which.
+    /// Puts a ray on the list of what it does next, if `counts` is 1, and has the memory for that fetched where the
+    /// tree is large, without a branch on which.
     HWY_INLINE void go_on(StreamRay& ray, uint32_t child, Lists& lists, uint32_t counts = 1) {
         ray.next = child;
         static_assert(StreamRay::kNothing == 0);
@@ -327,12 +338,15 @@ class Stream {
         lists.at_leaf += is_leaf & counts;
         lists.at_node += (1 - is_leaf - is_end) & counts;
         lists.at_end += is_end & counts;
+        if (!fetches_) {
+            return;
+        }
         const auto node = reinterpret_cast<uintptr_t>(nodes_ + child);
         const auto block = reinterpret_cast<uintptr_t>(blocks_ + WideNode::first_block(child));
         // A choice that compilers would make with a branch.
         const auto* wanted = reinterpret_cast<const char*>(  // NOLINT(performance-no-int-to-ptr)
             node ^ ((node ^ block) & (uintptr_t{0} - is_leaf)));
-        for (int line = 0; line < 5; ++line) {
+        for (int line = 0; line < kLinesFetched; ++line) {
             __builtin_prefetch(wanted + 64 * line);
         }
     }
@@ -392,6 +406,7 @@ class Stream {
     const WideNode* nodes_;
     const TriangleBlock* blocks_;
     OnDemand* on_demand_;
+    bool fetches_;
     std::span<const Ray> rays_;
     std::span<const uint32_t> batches_;  ///< those not yet set up, by the numbers of their first rays
     RayBatch batch_;
