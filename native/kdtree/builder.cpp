@@ -46,6 +46,9 @@ BuildParameters parameters_of(Quality quality) {
     throw std::invalid_argument("no such quality");
 }
 
+/// What a triangle usually adds to subtrees and wide nodes until they are in their places.
+constexpr size_t kTransientBytes = 28;
+
 /// The phases of a build, in order.
 class Builder {
  public:
@@ -59,7 +62,7 @@ class Builder {
         Stopwatch total;
         Stopwatch watch;
         PhaseTimes& phases = tree_.report.phases_ms;
-        std::optional<TransientMemory> memory(std::in_place);
+        std::optional<TransientMemory> memory(std::in_place, kTransientBytes * soup_.size());
         std::optional<TopLevels> top;
         std::optional<Subtrees> made(std::in_place, soup_, parameters_, cancel_, threads_, *memory);
         Subtrees& subtrees = *made;

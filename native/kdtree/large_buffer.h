@@ -118,23 +118,25 @@ class LargeBuffer {
     friend class TransientMemory;
     static constexpr size_t kPage = size_t{64} << 10;  ///< the largest small page of any system
     /// From here on clearing the rest of a huge page costs no more than small pages do, and little memory is wasted.
-    static constexpr size_t kHugePagesFrom = size_t{1536} << 10;
+    static constexpr size_t kHugePagesFrom = size_t{768} << 10;
     T* data_ = nullptr;
     size_t capacity_ = 0;
     void* mapping_ = nullptr;  ///< null also where the memory is another's
     size_t mapped_ = 0;
 };
 
-/// Memory for small buffers that are all given back together: whenever a piece is given back, all processors that use
-/// the process's memory have to be told, and wait.
+/// Memory for buffers that lie side by side, so that huge pages hold many small ones, and are all given back together:
+/// whenever a piece is given back, all processors that use the process's memory have to be told, and wait.
 class TransientMemory {
  public:
-    /// As LargeBuffer's constructor has it; must be destroyed before this. Any thread may call it.
+    explicit TransientMemory(size_t expected_bytes) : memory_(kBytes, expected_bytes) {}
+
+    /// Must be destroyed before this. Any thread may call it.
     template <class T>
-    LargeBuffer<T> take(size_t capacity, size_t expected_bytes = SIZE_MAX) {
+    LargeBuffer<T> take(size_t capacity) {
         constexpr size_t kLine = 64;
-        const size_t bytes = (capacity * sizeof(T) + kLine - 1) / kLine * kLine;
-        if (capacity < kBytes && std::min(bytes, expected_bytes) < LargeBuffer<T>::kHugePagesFrom) {
+        if (capacity < kBytes / sizeof(T)) {
+            const size_t bytes = (capacity * sizeof(T) + kLine - 1) / kLine * kLine;
             const size_t place = used_.fetch_add(bytes, std::memory_order_relaxed);
             if (place + bytes <= kBytes) {
                 LargeBuffer<T> taken;
@@ -143,12 +145,12 @@ class TransientMemory {
                 return taken;
             }
         }
-        return LargeBuffer<T>(capacity, expected_bytes);
+        return LargeBuffer<T>(capacity);
     }
 
  private:
     static constexpr size_t kBytes = size_t{64} << 20;  ///< of addresses, not of memory
-    LargeBuffer<std::byte> memory_{kBytes, 0};
+    LargeBuffer<std::byte> memory_;
     std::atomic<size_t> used_{0};
 };
 

@@ -19,9 +19,9 @@ namespace {
 struct Run {
     uint32_t begin;
     uint32_t end;
-    const WideNode* wide = nullptr;
+    int worker = 0;  ///< who has made its wide nodes
     uint32_t count = 0;
-    uint32_t made_at = 0;  ///< what the indices in `wide` count the first as
+    uint32_t made_at = 0;  ///< of the first, among the worker's
     uint32_t place = 0;    ///< of the first, among all
 };
 
@@ -92,22 +92,23 @@ class Collapse {
         cut_leaves(items, count, order);
 
         const uint32_t index = out.add();
-        WideNode& made = out.data()[index];
         std::array<Box3f, WideNode::kWidth> boxes;
         std::transform(items.begin(), items.begin() + count, boxes.begin(), [](const Item& item) { return item.box; });
-        order.write(std::span(boxes).first(static_cast<size_t>(count)), made);
+        order.write(std::span(boxes).first(static_cast<size_t>(count)), out[index]);
         for (int i = 0; i < count; ++i) {
             const Item& child = items[static_cast<size_t>(i)];
             if (child.blocks == 0 && is_empty(child.node)) {
                 continue;  // both halves of a split may have lost all they had; no ray meets the box of nothing
             }
+            uint32_t code = 0;
             if (child.blocks != 0 && child.blocks <= WideNode::kMaxLeafBlocks) {
-                made.child[i] = WideNode::leaf(child.first_block, child.blocks);
+                code = WideNode::leaf(child.first_block, child.blocks);
             } else if (const Run* run = child.blocks == 0 ? find_run(runs, child.node) : nullptr; run != nullptr) {
-                made.child[i] = run->place;
+                code = run->place;
             } else {
-                made.child[i] = collapse(child, out, runs);
+                code = collapse(child, out, runs);
             }
+            out[index].child[i] = code;
         }
         return index;
     }
@@ -257,16 +258,9 @@ std::vector<BlockTask> cut_to_tasks(std::span<const TreePiece> pieces) {
     return tasks;
 }
 
-/// How many wide nodes so many kd nodes and blocks may become.
-size_t most_nodes(size_t nodes, size_t blocks) { return nodes + blocks / (WideNode::kMaxLeafBlocks / 2) + 1; }
-
 }  // namespace
 
 void collapse_whole(std::span<const KdNode> nodes, const TreePiece& piece, WideNodes& out) {
-    const size_t most = most_nodes(nodes.size(), piece.part_boxes.size());
-    if (out.capacity() < most) {
-        out = WideNodes(2 * most, most / 8);
-    }
     out.clear();
     Collapse(nodes, {&piece, 1}).collapse(0, out, nullptr);
 }
@@ -284,19 +278,18 @@ void build_layout(const TriangleSoup& soup, std::span<const TreePiece> pieces, i
     const std::vector<BlockTask> block_tasks = cut_to_tasks(pieces);
     const Collapse collapse(tree.nodes.span(), pieces);
     const SizeClasses classes(tree.bounds);
-    const size_t most_wide_nodes = most_nodes(nodes, blocks);
     std::vector<WideNodes> made(static_cast<size_t>(threads));
     parallel_for(threads, runs.size() + block_tasks.size(), [&](size_t i, int worker) {
         if (i < runs.size()) {
             WideNodes& mine = made[static_cast<size_t>(worker)];
-            if (mine.data() == nullptr) {
-                mine = WideNodes(most_wide_nodes, nodes / 8 / static_cast<size_t>(threads), memory);
+            Run& run = runs[i];
+            run.worker = worker;
+            run.made_at = mine.count();
+            if (run.made_at == 0) {
+                mine = WideNodes(nodes / 5 / static_cast<size_t>(threads) + 64, memory);
             }
-            const uint32_t first = mine.count();
-            collapse.collapse(runs[i].begin, mine, nullptr);
-            runs[i].wide = mine.data() + first;
-            runs[i].count = mine.count() - first;
-            runs[i].made_at = first;
+            collapse.collapse(run.begin, mine, nullptr);
+            run.count = mine.count() - run.made_at;
             return;
         }
         const BlockTask& task = block_tasks[i - runs.size()];
@@ -305,7 +298,7 @@ void build_layout(const TriangleSoup& soup, std::span<const TreePiece> pieces, i
     });
 
     // The wide nodes above the runs, whose number is small. A tree that is one run has none.
-    WideNodes top(most_wide_nodes, runs.size(), memory);
+    WideNodes top(runs.size() + 64, memory);
     const auto place_runs = [&](uint32_t first) {
         for (Run& run : runs) {
             run.place = first;
@@ -320,13 +313,13 @@ void build_layout(const TriangleSoup& soup, std::span<const TreePiece> pieces, i
         collapse.collapse(0, top, &runs);
     }
     tree.wide_nodes = LargeBuffer<WideNode>(place_runs(top.count()));
-    std::copy_n(top.data(), top.count(), tree.wide_nodes.data());
+    std::copy_n(&top[0], top.count(), tree.wide_nodes.data());
     parallel_for(threads, runs.size(), [&](size_t i) {
         const Run& run = runs[i];
         tree.wide_nodes.take_pages(run.place, run.place + run.count);
         for (size_t n = 0; n < run.count; ++n) {
             WideNode& wide = tree.wide_nodes[run.place + n];
-            wide = run.wide[n];
+            wide = made[static_cast<size_t>(run.worker)][run.made_at + n];
             for (int child = 0; child < WideNode::kWidth; ++child) {
                 if ((wide.child[child] & WideNode::kLeafFlag) == 0) {
                     wide.child[child] += run.place - run.made_at;

@@ -266,7 +266,7 @@ uint32_t OnDemand::append(WideNodes& wide, std::span<const uint32_t> triangles) 
     const uint32_t first = add_nodes(wide.count());
     for (uint32_t i = 0; i < wide.count(); ++i) {
         WideNode& node = nodes_[first + i];
-        node = wide.data()[i];
+        node = wide[i];
         for (uint32_t& child : node.child) {
             const bool is_leaf = (child & WideNode::kLeafFlag) != 0;
             child = is_leaf ? WideNode::leaf(WideNode::first_block(child) + static_cast<uint32_t>(first_block),

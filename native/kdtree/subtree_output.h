@@ -35,9 +35,9 @@ struct Gap {
 class SubtreeOutput {
  public:
     SubtreeOutput() = default;
-    /// With room for what so many references usually become, in `memory` if there is one.
-    explicit SubtreeOutput(size_t references, TransientMemory* memory = nullptr) {
-        reserve(references / 2 + 64, 3 * references / kBlockSize * kBlockSize + 1024, memory);
+    /// With room for what so many triangles usually become, in `memory` if there is one.
+    explicit SubtreeOutput(size_t triangles, TransientMemory* memory = nullptr) {
+        reserve(triangles / 5 + 64, 9 * triangles / 4 / kBlockSize * kBlockSize + 1024, memory);
     }
 
     size_t node_count() const { return node_count_; }
@@ -138,10 +138,7 @@ class SubtreeOutput {
         const size_t blocks = triangles / kBlockSize;
         const size_t bytes =
             nodes * (sizeof(KdNode) + sizeof(Box3f)) + blocks * (kBlockSize * sizeof(uint32_t) + sizeof(Box3f));
-        // Half of each array is used as a rule: huge pages would waste much of a small tree's memory.
-        const size_t expected = bytes < 2 * LargeBuffer<std::byte>::kHugePage ? 0 : bytes;
-        auto memory = transient != nullptr ? transient->take<std::byte>(bytes, expected)
-                                           : LargeBuffer<std::byte>(bytes, expected);
+        auto memory = transient != nullptr ? transient->take<std::byte>(bytes) : LargeBuffer<std::byte>(bytes);
         auto* new_nodes = reinterpret_cast<KdNode*>(memory.data());
         auto* new_boxes = reinterpret_cast<Box3f*>(new_nodes + nodes);
         auto* new_part_boxes = new_boxes + nodes;

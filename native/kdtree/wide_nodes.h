@@ -6,6 +6,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <span>
+#include <utility>
 
 #include "geometry/vec.h"
 #include "kdtree/large_buffer.h"
@@ -13,27 +14,35 @@
 
 namespace espalier {
 
-/// Wide nodes in the order in which they are made. Reserved for the worst case, taken page by page.
+/// Wide nodes in the order in which they are made.
 class WideNodes {
  public:
     WideNodes() = default;
-    WideNodes(size_t capacity, size_t expected) : nodes_(capacity, expected * sizeof(WideNode)) {}
-    WideNodes(size_t capacity, size_t expected, TransientMemory& memory)
-        : nodes_(memory.take<WideNode>(capacity, expected * sizeof(WideNode))) {}
+    /// With room for so many for now.
+    WideNodes(size_t capacity, TransientMemory& memory) : nodes_(memory.take<WideNode>(capacity)) {}
+
     uint32_t add() {
         if (count_ == limit_) {
-            constexpr uint32_t kStretch = 256;
-            limit_ += kStretch;
-            nodes_.take_pages(count_, limit_);
+            make_room();
         }
         return count_++;
     }
     uint32_t count() const { return count_; }
-    size_t capacity() const { return nodes_.size(); }
-    WideNode* data() { return nodes_.data(); }
+    WideNode& operator[](size_t i) { return nodes_[i]; }
     void clear() { count_ = 0; }
 
  private:
+    void make_room() {
+        constexpr size_t kStretch = 256;  // pages are taken for so many at a time
+        if (count_ == nodes_.size()) {
+            LargeBuffer<WideNode> larger(2 * nodes_.size() + kStretch);
+            std::copy_n(nodes_.data(), count_, larger.data());
+            nodes_ = std::move(larger);
+        }
+        limit_ = static_cast<uint32_t>(std::min(nodes_.size(), count_ + kStretch));
+        nodes_.take_pages(count_, limit_);
+    }
+
     LargeBuffer<WideNode> nodes_;
     uint32_t count_ = 0;
     uint32_t limit_ = 0;  ///< for so many, pages have been taken
