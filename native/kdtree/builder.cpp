@@ -47,7 +47,7 @@ BuildParameters parameters_of(Quality quality) {
 }
 
 /// What a triangle usually adds to subtrees and wide nodes until they are in their places.
-constexpr size_t kTransientBytes = 28;
+constexpr size_t kTransientBytes = 30;
 
 /// The phases of a build, in order.
 class Builder {
@@ -71,7 +71,7 @@ class Builder {
             phases.bounds = watch.lap();
         } else {
             top.emplace(soup_, parameters_, cancel_, threads_);
-            top->make_references();
+            top->make_references(&*memory);
             phases.bounds = watch.lap();
             tree_.report.rejected_faces = top->rejected();
             tree_.bounds = top->nodes()[0].node.cell;

@@ -47,9 +47,8 @@ class LargeBuffer {
         if (capacity > SIZE_MAX / 2 / sizeof(T)) {
             throw std::bad_alloc();
         }
-        // A tail too short for a huge page of its own is left to small ones.
-        const size_t huge = (std::min(bytes(), expected_bytes) + kHugePage - kHugePagesFrom) / kHugePage * kHugePage;
-        mapped_ = bytes() + (huge != 0 ? kHugePage : 0);
+        const size_t huge = kHugePage * huge_pages(std::min(bytes(), expected_bytes));
+        mapped_ = std::max(bytes(), huge) + (huge != 0 ? kHugePage : 0);
         void* memory =
             ::mmap(nullptr, mapped_, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);
         if (memory == MAP_FAILED) {
@@ -58,7 +57,7 @@ class LargeBuffer {
         mapping_ = memory;
         if (huge != 0) {
             size_t space = mapped_;
-            std::align(kHugePage, bytes(), memory, space);
+            std::align(kHugePage, huge, memory, space);
             ::madvise(memory, huge, MADV_HUGEPAGE);
         }
         data_ = static_cast<T*>(memory);
@@ -76,6 +75,9 @@ class LargeBuffer {
             ::munmap(mapping_, mapped_);
         }
     }
+
+    /// How many of them so many bytes are worth: a tail too short for one of its own is left to small ones.
+    static size_t huge_pages(size_t bytes) { return (bytes + kHugePage - kHugePagesFrom) / kHugePage; }
 
     /// The same memory for other items, whatever it holds; what they do not need is given back. Fresh memory if they
     /// need more.
@@ -129,16 +131,19 @@ class LargeBuffer {
 /// whenever a piece is given back, all processors that use the process's memory have to be told, and wait.
 class TransientMemory {
  public:
-    explicit TransientMemory(size_t expected_bytes) : memory_(kBytes, expected_bytes) {}
+    /// expected_bytes: how much of it will usually be used.
+    explicit TransientMemory(size_t expected_bytes)
+        : memory_(std::max(kLeastBytes, 2 * expected_bytes), expected_bytes),
+          huge_pages_(LargeBuffer<std::byte>::huge_pages(expected_bytes)) {}
 
-    /// Must be destroyed before this. Any thread may call it.
+    /// What it returns must be destroyed before this. Any thread may call it.
     template <class T>
     LargeBuffer<T> take(size_t capacity) {
         constexpr size_t kLine = 64;
-        if (capacity < kBytes / sizeof(T)) {
+        if (capacity < memory_.size() / sizeof(T)) {
             const size_t bytes = (capacity * sizeof(T) + kLine - 1) / kLine * kLine;
             const size_t place = used_.fetch_add(bytes, std::memory_order_relaxed);
-            if (place + bytes <= kBytes) {
+            if (place + bytes <= memory_.size()) {
                 LargeBuffer<T> taken;
                 taken.data_ = reinterpret_cast<T*>(memory_.data() + place);
                 taken.capacity_ = capacity;
@@ -148,9 +153,17 @@ class TransientMemory {
         return LargeBuffer<T>(capacity);
     }
 
+    /// It has so many huge pages, which are taken when they are first written to, or now.
+    size_t huge_pages() const { return huge_pages_; }
+    void take_huge_page(size_t page) {
+        constexpr size_t kPage = LargeBuffer<std::byte>::kHugePage;
+        memory_.take_pages(page * kPage, (page + 1) * kPage);
+    }
+
  private:
-    static constexpr size_t kBytes = size_t{64} << 20;  ///< of addresses, not of memory
+    static constexpr size_t kLeastBytes = size_t{64} << 20;  ///< of addresses, not of memory
     LargeBuffer<std::byte> memory_;
+    size_t huge_pages_;
     std::atomic<size_t> used_{0};
 };
 

@@ -48,7 +48,7 @@ class Collapse {
     Collapse(std::span<const KdNode> nodes, std::span<const TreePiece> pieces) : nodes_(nodes), pieces_(pieces) {}
 
     /// Appends the wide node for a kd node and all below it; returns its index. A kd node listed in `runs` is not
-    /// entered: its child code is the index of its run, marked for the caller to resolve.
+    /// entered: its child code is the place of its run.
     uint32_t collapse(uint32_t kd_node, WideNodes& out, const std::vector<Run>* runs) const {
         return collapse(item(kd_node, pieces_.front()), out, runs);
     }
@@ -231,7 +231,7 @@ void find_runs(const Tree& tree, uint32_t begin, uint32_t end, uint32_t longest,
         return;  // the node above takes it as it is
     }
     if (end - begin <= longest) {
-        runs.push_back({begin, end, {}});
+        runs.push_back({begin, end});
         return;
     }
     find_runs(tree, begin + 1, node.right_child(), longest, runs);

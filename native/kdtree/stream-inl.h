@@ -297,18 +297,23 @@ class Stream {
             return leaves;
         }
         uint32_t left = 0;
+        uint32_t passing = 0;
         for (uint32_t i = 0; i < leaves; ++i) {
             StreamRay& ray = *leaf_list_[i];
             const uint32_t leaf = ray.next;
-            asked_list_[left] = &ray;
-            asked_leaf_[left] = leaf;
             uint32_t meets = 1;
             if (!WideNode::is_unopened(leaf)) [[likely]] {
                 meets = at_most_one(
                     lanes_in_question<kExact>(ray, blocks_[WideNode::first_block(leaf)], batch_.least_inside()));
-                leave(ray, leaf, lists, 1 - meets);
             }
+            asked_list_[left] = &ray;
+            asked_leaf_[left] = leaf;
+            passing_list_[passing] = &ray;
             left += meets;
+            passing += 1 - meets;
+        }
+        for (uint32_t i = 0; i < passing; ++i) {
+            leave(*passing_list_[i], passing_list_[i]->next, lists);
         }
         return left;
     }
@@ -414,8 +419,9 @@ class Stream {
     uint32_t end_ = 0;
     StreamRay* node_list_[kInFlight + 1];
     StreamRay* leaf_list_[kInFlight + 1];
-    StreamRay* asked_list_[kInFlight];  ///< and may meet something
-    uint32_t asked_leaf_[kInFlight];    ///< there
+    StreamRay* asked_list_[kInFlight + 1];    ///< and may meet something
+    StreamRay* passing_list_[kInFlight + 1];  ///< and do not
+    uint32_t asked_leaf_[kInFlight + 1];      ///< there
     StreamRay* end_list_[kInFlight + 1];
     Meeting meetings_[kInFlight];
     StreamRay ray_[kInFlight];

@@ -37,7 +37,7 @@ class SubtreeOutput {
     SubtreeOutput() = default;
     /// With room for what so many triangles usually become, in `memory` if there is one.
     explicit SubtreeOutput(size_t triangles, TransientMemory* memory = nullptr) {
-        reserve(triangles / 5 + 64, 9 * triangles / 4 / kBlockSize * kBlockSize + 1024, memory);
+        reserve(triangles / 5 + 64, 5 * triangles / 2 / kBlockSize * kBlockSize + 1024, memory);
     }
 
     size_t node_count() const { return node_count_; }

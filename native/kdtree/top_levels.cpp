@@ -54,18 +54,13 @@ TopLevels::TopLevels(const TriangleSoup& soup, const BuildParameters& parameters
               most_block_bytes(soup.size()), usual_block_bytes(soup.size())),
       scratch_(static_cast<size_t>(threads)) {}
 
-void TopLevels::make_references() {
-    const uint32_t triangles = soup_.size();
-    const size_t count = (triangles + segment_size_ - 1) / segment_size_;
-    // Every thread takes pages of its own: two that first wrote to one page at the same time would both clear it.
-    constexpr size_t kPages = LargeBuffer<uint32_t>::kHugePage / sizeof(uint32_t);
-    const size_t usual = std::max(usual_block_bytes(triangles) / sizeof(uint32_t), memory_.first().words());
-    parallel_for(threads_, usual / kPages + 1,
-                 [&](size_t i) { memory_.first().memory().take_pages(i * kPages, std::min(usual, (i + 1) * kPages)); });
-
+void TopLevels::make_references(TransientMemory* transient) {
+    take_pages(transient);
     if (is_large_ && sort_root()) {
         return;
     }
+    const uint32_t triangles = soup_.size();
+    const size_t count = (triangles + segment_size_ - 1) / segment_size_;
     std::vector<Box3f> bounds(count);
     std::vector<RejectedFaces> rejected(count);
     TopNode root{};
@@ -88,6 +83,22 @@ void TopLevels::make_references() {
     }
     root.node = {box, box, valid, spare_references(triangles), 0};
     nodes_.push_back(std::move(root));
+}
+
+/// Every thread takes pages of its own: two that first wrote to one page at the same time would both clear it.
+void TopLevels::take_pages(TransientMemory* transient) {
+    constexpr size_t kPage = LargeBuffer<uint32_t>::kHugePage / sizeof(uint32_t);
+    ReferenceBuffer& places = memory_.first();
+    const size_t words = std::max(usual_block_bytes(soup_.size()) / sizeof(uint32_t), places.words());
+    const size_t others = transient != nullptr ? transient->huge_pages() : 0;
+    parallel_for(threads_, others + words / kPage + 1, [&](size_t i) {
+        if (i < others) {
+            transient->take_huge_page(i);
+        } else {
+            const size_t page = i - others;
+            places.memory().take_pages(page * kPage, std::min(words, (page + 1) * kPage));
+        }
+    });
 }
 
 /// False if a sample has no plane for that, or if so many faces straddle its planes that they are not worth it.

@@ -61,8 +61,8 @@ class TopLevels {
               int threads);
 
     /// Phase 1: boxes of all faces that can be hit. Those of a large scene are sorted as they are made by the leaves of
-    /// a multiway split, so that they go through memory once.
-    void make_references();
+    /// a multiway split, so that they go through memory once. transient: whose huge pages all threads take as well.
+    void make_references(TransientMemory* transient = nullptr);
     /// Phase 2: splits every node of more than `cut` references, breadth first, but for a large scene's.
     void split_above(uint32_t cut);
 
@@ -80,6 +80,7 @@ class TopLevels {
         uint32_t node;
         uint32_t segment;
     };
+    void take_pages(TransientMemory* transient);
     bool sort_root();
     Box3f bound_vertices() const;
     MultiwaySplit choose_multiway_split(const Box3f& bounds) const;

@@ -7,6 +7,7 @@
 
 #include "kdtree/large_buffer.h"
 #include "kdtree/parallel.h"
+#include "kdtree/subtree_output.h"
 #include "kdtree/wide_nodes.h"
 
 namespace espalier {
@@ -62,6 +63,43 @@ TEST(WideNodes, KeepWhatTheyHoldAsTheyGrow) {
         }
         nodes->clear();
         EXPECT_EQ(nodes->add(), 0U);
+    }
+}
+
+/// Many inner nodes of two leaves each, one of them in part of a block and one in several.
+TEST(SubtreeOutput, KeepsWhatItHoldsAsItGrows) {
+    constexpr uint32_t kInner = 3000;
+    const auto box_of = [](uint32_t i) {
+        const auto at = static_cast<float>(i);
+        return Box3f{{at, at, at}, {at + 1, at + 1, at + 1}};
+    };
+    TransientMemory memory(0);
+    SubtreeOutput output(100, &memory);
+    for (uint32_t i = 0; i < kInner; ++i) {
+        const size_t inner = output.open_inner();
+        output.add_leaf(std::vector<uint32_t>{i, i + 1, i + 2}, box_of(i));
+        const size_t right = output.node_count();
+        output.add_leaf(std::vector<uint32_t>(20, i), box_of(i + 1));
+        output.close_inner(inner, {1, static_cast<float>(i)}, right);
+    }
+    ASSERT_EQ(output.node_count(), size_t{3} * kInner);
+    ASSERT_EQ(output.triangle_count(), size_t{4} * kBlockSize * kInner);
+    const TreePiece whole = output.whole();
+    for (uint32_t i = 0; i < kInner; ++i) {
+        const KdNode* node = &output.nodes()[size_t{3} * i];
+        ASSERT_FALSE(node[0].is_leaf());
+        ASSERT_EQ(node[0].right_child(), 3 * i + 2);
+        ASSERT_EQ(node[0].split(), static_cast<float>(i));
+        ASSERT_EQ(node[1].references(), 3U);
+        ASSERT_EQ(node[2].references(), 20U);
+        const uint32_t* triangles = &whole.triangles[size_t{4} * kBlockSize * i];
+        ASSERT_EQ(node[2].first_block(), 4 * i + 1);
+        ASSERT_EQ(triangles[2], i + 2);
+        ASSERT_EQ(triangles[3], kNoTriangle);
+        ASSERT_EQ(std::count(triangles + kBlockSize, triangles + 4 * kBlockSize, i), 20);
+        ASSERT_EQ(whole.box(3 * i).lower.x, static_cast<float>(i));
+        ASSERT_EQ(whole.box(3 * i).upper.x, static_cast<float>(i + 2));
+        ASSERT_EQ(whole.part_box(4 * i + 3).lower.y, static_cast<float>(i + 1));
     }
 }
 
