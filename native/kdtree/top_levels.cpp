@@ -85,12 +85,14 @@ void TopLevels::make_references(TransientMemory* transient) {
     nodes_.push_back(std::move(root));
 }
 
-/// Every thread takes pages of its own: two that first wrote to one page at the same time would both clear it.
+/// Every thread takes pages of its own: two that first wrote to one page at the same time would both clear it. So do
+/// those that share the few huge pages of a small build's transient memory; of a large one's, many may not be needed.
 void TopLevels::take_pages(TransientMemory* transient) {
     constexpr size_t kPage = LargeBuffer<uint32_t>::kHugePage / sizeof(uint32_t);
     ReferenceBuffer& places = memory_.first();
     const size_t words = std::max(usual_block_bytes(soup_.size()) / sizeof(uint32_t), places.words());
-    const size_t others = transient != nullptr ? transient->huge_pages() : 0;
+    const bool is_shared = transient != nullptr && transient->huge_pages() <= static_cast<size_t>(threads_);
+    const size_t others = is_shared ? transient->huge_pages() : 0;
     parallel_for(threads_, others + words / kPage + 1, [&](size_t i) {
         if (i < others) {
             transient->take_huge_page(i);

@@ -61,7 +61,7 @@ class TopLevels {
               int threads);
 
     /// Phase 1: boxes of all faces that can be hit. Those of a large scene are sorted as they are made by the leaves of
-    /// a multiway split, so that they go through memory once. transient: whose huge pages all threads take as well.
+    /// a multiway split, so that they go through memory once. transient: whose huge pages are taken as well, if few.
     void make_references(TransientMemory* transient = nullptr);
     /// Phase 2: splits every node of more than `cut` references, breadth first, but for a large scene's.
     void split_above(uint32_t cut);
