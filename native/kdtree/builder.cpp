@@ -47,7 +47,7 @@ BuildParameters parameters_of(Quality quality) {
 }
 
 /// What a triangle usually adds to subtrees and wide nodes until they are in their places.
-constexpr size_t kTransientBytes = 30;
+constexpr size_t kTransientBytes = 22;
 
 /// The phases of a build, in order.
 class Builder {

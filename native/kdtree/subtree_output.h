@@ -138,7 +138,9 @@ class SubtreeOutput {
         const size_t blocks = triangles / kBlockSize;
         const size_t bytes =
             nodes * (sizeof(KdNode) + sizeof(Box3f)) + blocks * (kBlockSize * sizeof(uint32_t) + sizeof(Box3f));
-        auto memory = transient != nullptr ? transient->take<std::byte>(bytes) : LargeBuffer<std::byte>(bytes);
+        // What has grown is twice as large as it had to be.
+        auto memory =
+            transient != nullptr ? transient->take<std::byte>(bytes) : LargeBuffer<std::byte>(bytes, bytes / 2);
         auto* new_nodes = reinterpret_cast<KdNode*>(memory.data());
         auto* new_boxes = reinterpret_cast<Box3f*>(new_nodes + nodes);
         auto* new_part_boxes = new_boxes + nodes;
