@@ -189,7 +189,7 @@ class Stream {
             uint32_t meeting = 0;
             for (uint32_t i = 0; i < leaves; ++i) {
                 StreamRay& ray = kAsksFirst ? *asked_list_[i] : *leaf_list_[i];
-                const uint32_t leaf = kAsksFirst ? asked_leaf_[i] : ray.next;
+                const uint32_t leaf = ray.next;
                 if (WideNode::is_unopened(leaf)) [[unlikely]] {
                     go_on(ray, on_demand_->open(leaf), lists);
                     continue;
@@ -307,7 +307,6 @@ class Stream {
                     lanes_in_question<kExact>(ray, blocks_[WideNode::first_block(leaf)], batch_.least_inside()));
             }
             asked_list_[left] = &ray;
-            asked_leaf_[left] = leaf;
             passing_list_[passing] = &ray;
             left += meets;
             passing += 1 - meets;
@@ -419,9 +418,8 @@ class Stream {
     uint32_t end_ = 0;
     StreamRay* node_list_[kInFlight + 1];
     StreamRay* leaf_list_[kInFlight + 1];
-    StreamRay* asked_list_[kInFlight + 1];    ///< and may meet something
+    StreamRay* asked_list_[kInFlight + 1];    ///< and may meet something there
     StreamRay* passing_list_[kInFlight + 1];  ///< and do not
-    uint32_t asked_leaf_[kInFlight + 1];      ///< there
     StreamRay* end_list_[kInFlight + 1];
     Meeting meetings_[kInFlight];
     StreamRay ray_[kInFlight];
