@@ -46,8 +46,8 @@ BuildParameters parameters_of(Quality quality) {
     throw std::invalid_argument("no such quality");
 }
 
-/// What a triangle usually adds to subtrees and wide nodes until they are in their places.
-constexpr size_t kTransientBytes = 22;
+/// What a triangle usually adds to subtrees until they are in their places, and to the plans of their nodes.
+constexpr size_t kTransientBytes = 19;
 
 /// The phases of a build, in order.
 class Builder {

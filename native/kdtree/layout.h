@@ -5,7 +5,6 @@
 
 #include "kdtree/tree.h"
 #include "kdtree/tree_piece.h"
-#include "kdtree/wide_nodes.h"
 
 namespace espalier {
 
@@ -14,8 +13,5 @@ namespace espalier {
 /// pieces: of all nodes, in order; tree.blocks has room for their triangles.
 void build_layout(const TriangleSoup& soup, std::span<const TreePiece> pieces, int threads, TransientMemory& memory,
                   Tree& tree);
-
-/// The wide nodes alone, of a subtree by itself: root first, with indices that count from there.
-void collapse_whole(std::span<const KdNode> nodes, const TreePiece& piece, WideNodes& out);
 
 }  // namespace espalier

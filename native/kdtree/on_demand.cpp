@@ -6,7 +6,7 @@
 #include <stdexcept>
 #include <utility>
 
-#include "kdtree/layout.h"
+#include "kdtree/child_order.h"
 #include "kdtree/parallel.h"
 
 namespace espalier {
@@ -76,20 +76,20 @@ uint32_t OnDemand::lay_out(uint32_t top_node) {
     const auto at = [&](uint32_t i) -> const TopNode& { return top_.nodes()[i]; };
     std::array<uint32_t, WideNode::kWidth> items{top_node};
     ChildOrder order;
-    int count = 1;
-    while (count < WideNode::kWidth) {
-        int widest = -1;
-        for (int i = 0; i < count; ++i) {
-            const TopNode& item = at(items[static_cast<size_t>(i)]);
-            if (item.is_split() && (widest < 0 || half_area(item.node.tight) >
-                                                      half_area(at(items[static_cast<size_t>(widest)]).node.tight))) {
+    size_t count = 1;
+    while (count < items.size()) {
+        size_t widest = count;
+        for (size_t i = 0; i < count; ++i) {
+            const TopNode& item = at(items[i]);
+            if (item.is_split() &&
+                (widest == count || half_area(item.node.tight) > half_area(at(items[widest]).node.tight))) {
                 widest = i;
             }
         }
-        if (widest < 0) {
+        if (widest == count) {
             break;
         }
-        uint32_t& opened = items[static_cast<size_t>(widest)];
+        uint32_t& opened = items[widest];
         const TopNode& parent = at(opened);
         if (at(parent.left).node.count == 0 || at(parent.right).node.count == 0) {  // nothing takes no place
             opened = at(parent.left).node.count == 0 ? parent.right : parent.left;
@@ -97,19 +97,18 @@ uint32_t OnDemand::lay_out(uint32_t top_node) {
         }
         order.split(parent.split.axis, widest, count);
         opened = parent.left;
-        items[static_cast<size_t>(count++)] = parent.right;
+        items[count++] = parent.right;
     }
     const uint32_t index = add_nodes(1);
-    std::array<Box3f, WideNode::kWidth> boxes;
-    for (int i = 0; i < count; ++i) {
-        boxes[static_cast<size_t>(i)] = at(items[static_cast<size_t>(i)]).node.tight;
-    }
-    order.write(std::span(boxes).first(static_cast<size_t>(count)), nodes_[index]);
-    for (int i = 0; i < count; ++i) {
-        const TopNode& item = at(items[static_cast<size_t>(i)]);
+    WideNode& wide = nodes_[index];
+    order.write(count, wide);
+    for (size_t i = 0; i < count; ++i) {
+        const TopNode& item = at(items[i]);
+        set_box(wide, i, item.node.tight);
         if (item.node.count > 0) {
-            nodes_[index].child[i] =
-                item.is_split() ? lay_out(items[static_cast<size_t>(i)]) : new_part(item.node, &item, {});
+            wide.child[i] = item.is_split() ? lay_out(items[i]) : new_part(item.node, &item, {});
+        } else {
+            wide.child[i] = WideNode::leaf(0, 1);
         }
     }
     return index;
@@ -214,7 +213,7 @@ uint32_t OnDemand::divide(const OpenNode& node, Scratch& scratch) {
         if (widest->node.count == 0) {
             *widest = right;  // nothing takes no place
         } else if (right.node.count != 0) {
-            order.split(split.axis, static_cast<int>(widest - items.data()), static_cast<int>(count));
+            order.split(split.axis, static_cast<size_t>(widest - items.data()), count);
             items[count++] = right;
         }
     }
@@ -229,16 +228,15 @@ uint32_t OnDemand::divide(const OpenNode& node, Scratch& scratch) {
     }
     const References memory = memory_.take(static_cast<uint32_t>(references + ReferenceBuffer::kSlack));
     const uint32_t index = add_nodes(1);
-    std::array<Box3f, WideNode::kWidth> boxes;
-    std::transform(items.begin(), items.begin() + static_cast<std::ptrdiff_t>(count), boxes.begin(),
-                   [](const Item& item) { return item.node.tight; });
-    order.write(std::span(boxes).first(count), nodes_[index]);
+    WideNode& wide = nodes_[index];
+    order.write(count, wide);
     size_t begin = 0;
     for (size_t i = 0; i < count; ++i) {
         const References place = memory.at(begin);
         copy_references(at(items[i].begin), items[i].node.count, place);
         begin += items[i].node.count;
-        nodes_[index].child[i] = new_part(items[i].node, nullptr, place);
+        set_box(wide, i, items[i].node.tight);
+        wide.child[i] = new_part(items[i].node, nullptr, place);
     }
     return index;
 }
@@ -251,29 +249,21 @@ uint32_t OnDemand::build_whole(const OpenNode& node, Scratch& scratch) {
     kernels_.build_subtree(
         {&soup_, &parameters_, nullptr, nullptr, nullptr, room.references(), 0, node.count, room.capacity()}, node,
         output);
-    collapse_whole(output.nodes(), output.whole(), scratch.wide);
-    return append(scratch.wide, output.triangles());
-}
-
-/// Moves wide nodes and blocks to where rays find them; returns the index of the first.
-uint32_t OnDemand::append(WideNodes& wide, std::span<const uint32_t> triangles) {
-    const size_t blocks = triangles.size() / kBlockSize;
+    const size_t blocks = output.triangles().size() / kBlockSize;
     const size_t first_block = block_count_.fetch_add(blocks, std::memory_order_relaxed);
     if (first_block + blocks > most_blocks_) {
         throw std::length_error("the tree needs more triangle blocks than it has room for");
     }
-    kernels_.write_blocks(soup_, classes_, triangles.data(), blocks, blocks_ + first_block);
-    const uint32_t first = add_nodes(wide.count());
-    for (uint32_t i = 0; i < wide.count(); ++i) {
-        WideNode& node = nodes_[first + i];
-        node = wide[i];
-        for (uint32_t& child : node.child) {
-            const bool is_leaf = (child & WideNode::kLeafFlag) != 0;
-            child = is_leaf ? WideNode::leaf(WideNode::first_block(child) + static_cast<uint32_t>(first_block),
-                                             WideNode::blocks(child))
-                            : child + first;
-        }
-    }
+    kernels_.write_blocks(soup_, classes_, output.triangles().data(), blocks, blocks_ + first_block);
+
+    Run whole{0, static_cast<uint32_t>(output.node_count()), {}};
+    scratch.plans.resize(std::max(scratch.plans.size(), output.node_count()));
+    const TreePiece piece = output.whole();
+    const Collapse collapse(output.nodes(), {&piece, 1}, scratch.plans);
+    collapse.plan(whole);
+    const uint32_t count = collapse.wide_nodes(0);
+    const uint32_t first = add_nodes(count);
+    collapse.write({0, first, count}, static_cast<uint32_t>(first_block), nodes_);
     return first;
 }
 

@@ -6,9 +6,9 @@
 #include <mutex>
 #include <vector>
 
+#include "kdtree/collapse.h"
 #include "kdtree/subtree_output.h"
 #include "kdtree/top_levels.h"
-#include "kdtree/wide_nodes.h"
 
 namespace espalier {
 
@@ -49,7 +49,7 @@ class OnDemand {
     struct Scratch {
         ReferenceBuffer room;
         SubtreeOutput output{kWholeOutput};
-        WideNodes wide;
+        std::vector<SpreadPlan> plans;
     };
     static constexpr size_t kWholeOutput = 16384;
 
@@ -59,7 +59,6 @@ class OnDemand {
     std::unique_ptr<Scratch> take_scratch();
     uint32_t divide(const OpenNode& node, Scratch& scratch);
     uint32_t build_whole(const OpenNode& node, Scratch& scratch);
-    uint32_t append(WideNodes& wide, std::span<const uint32_t> triangles);
     uint32_t add_nodes(uint32_t count);
 
     const TriangleSoup soup_;

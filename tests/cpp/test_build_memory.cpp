@@ -8,7 +8,6 @@
 #include "kdtree/large_buffer.h"
 #include "kdtree/parallel.h"
 #include "kdtree/subtree_output.h"
-#include "kdtree/wide_nodes.h"
 
 namespace espalier {
 namespace {
@@ -45,24 +44,6 @@ TEST(TransientMemory, TakesNoMoreThanItHas) {
     for (size_t i = 0; i < buffers.size(); ++i) {
         EXPECT_EQ(buffers[i][0], std::byte(i));
         EXPECT_EQ(buffers[i][buffers[i].size() - 1], std::byte(i));
-    }
-}
-
-TEST(WideNodes, KeepWhatTheyHoldAsTheyGrow) {
-    constexpr uint32_t kNodes = 5000;
-    TransientMemory memory(0);
-    WideNodes with_room(100, memory);
-    WideNodes without;
-    for (WideNodes* nodes : {&with_room, &without}) {
-        for (uint32_t i = 0; i < kNodes; ++i) {
-            ASSERT_EQ(nodes->add(), i);
-            (*nodes)[i].child[0] = i;
-        }
-        for (uint32_t i = 0; i < kNodes; ++i) {
-            ASSERT_EQ((*nodes)[i].child[0], i);
-        }
-        nodes->clear();
-        EXPECT_EQ(nodes->add(), 0U);
     }
 }
 

@@ -13,7 +13,7 @@
 #include "kdtree/candidate.h"
 #include "kdtree/size_class.h"
 #include "kdtree/traversal.h"
-#include "kdtree/wide_nodes.h"
+#include "kdtree/child_order.h"
 #include "meshes.h"
 
 namespace espalier {
