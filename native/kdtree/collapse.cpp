@@ -18,15 +18,6 @@ namespace hn = hwy::HWY_NAMESPACE;
 
 constexpr uint32_t kPlaces = Spread::kPlaces;
 
-// What it costs a ray to visit a wide node, to get to a leaf, and to test one or two blocks of it.
-#ifndef CN
-#define CN 2
-#define CE 1
-#endif
-constexpr float kNodeCost = CN;
-constexpr float kLeafCost = CE;
-constexpr float kStepCost = 2;
-
 /// A leaf or part of one.
 struct LeafPart {
     const TreePiece* piece;
@@ -169,7 +160,7 @@ void plan_leaf(const LeafPart& leaf, Spread& spread, SpreadPlan& plan) {
     plan_leaf(right, spreads[1], unused);
     const Shares shares(spreads[0], spreads[1]);
     if (leaf.is_long()) {
-        shares.take_node(half_area(leaf.box) * kNodeCost, spread, plan);
+        shares.take_node(half_area(leaf.box) * kWideNodeCost, spread, plan);
     } else {
         shares.take_leaf(leaf.cost(), spread, plan);
     }
@@ -201,12 +192,12 @@ class Collapse::Planner {
             plan = collapse_.plans_[left];
             of_right = of_left;
         } else {
-            Shares(of_left, of_right).take_node(half_area(piece_->box(node)) * kNodeCost, of_right, plan);
+            Shares(of_left, of_right).take_node(half_area(piece_->box(node)) * kWideNodeCost, of_right, plan);
         }
     }
 
     /// Plans a node and all below it but for runs, which are taken off the end of these.
-    void plan_above(uint32_t node, std::span<const Run>& runs) {
+    void plan_above(uint32_t node, std::span<const KdRun>& runs) {
         if (!runs.empty() && runs.back().begin == node) {
             push() = runs.back().spread;
             runs = runs.first(runs.size() - 1);
@@ -242,7 +233,7 @@ class Collapse::Writer {
         : collapse_(collapse), piece_(&collapse.pieces_.front()), first_block_(first_block), next_(place), wide_(wide) {}
 
     /// Subtrees in these are left out.
-    void leave(std::span<const Run> runs) { runs_ = runs; }
+    void leave(std::span<const KdRun> runs) { runs_ = runs; }
     const std::vector<WideSubtree>& left() const { return left_; }
 
     /// Writes the wide node that a kd node becomes, and those below it.
@@ -277,13 +268,13 @@ class Collapse::Writer {
 
     uint32_t write(const LeafPart& leaf) {
         Row row(wide_[next_]);
-        if (leaf.is_divisible()) {
+        if (leaf.is_long()) {
             Spread spread;
             SpreadPlan plan;
             plan_leaf(leaf, spread, plan);
             open(row, leaf, 0, kPlaces, plan.left_places[0]);
-        } else {
-            place(row, leaf, 0, 1);
+        } else {  // the whole tree
+            place(row, leaf, 0, kPlaces);
         }
         return finish(row);
     }
@@ -389,7 +380,7 @@ class Collapse::Writer {
 
     bool is_left(uint32_t node) const {
         const auto after = std::upper_bound(runs_.begin(), runs_.end(), node,
-                                            [](uint32_t n, const Run& run) { return n < run.begin; });
+                                            [](uint32_t n, const KdRun& run) { return n < run.begin; });
         return after != runs_.begin() && node < (after - 1)->end;
     }
 
@@ -398,11 +389,11 @@ class Collapse::Writer {
     const uint32_t first_block_;
     uint32_t next_;
     WideNode* wide_;
-    std::span<const Run> runs_;
+    std::span<const KdRun> runs_;
     std::vector<WideSubtree> left_;
 };
 
-void Collapse::plan(Run& run) const {
+void Collapse::plan(KdRun& run) const {
     Planner planner(*this);
     for (uint32_t node = run.end; node-- > run.begin;) {
         planner.plan(node);
@@ -410,13 +401,13 @@ void Collapse::plan(Run& run) const {
     run.spread = planner.last();
 }
 
-void Collapse::plan_above(std::span<const Run> runs) const { Planner(*this).plan_above(0, runs); }
+void Collapse::plan_above(std::span<const KdRun> runs) const { Planner(*this).plan_above(0, runs); }
 
 void Collapse::write(const WideSubtree& subtree, uint32_t first_block, WideNode* wide) const {
     Writer(*this, first_block, subtree.place, wide).write(subtree.node);
 }
 
-std::vector<WideSubtree> Collapse::write_above(std::span<const Run> runs, WideNode* wide) const {
+std::vector<WideSubtree> Collapse::write_above(std::span<const KdRun> runs, WideNode* wide) const {
     if (runs.size() == 1 && runs.front().begin == 0) {
         return {{0, 0, wide_nodes(0)}};
     }

@@ -11,6 +11,11 @@
 
 namespace espalier {
 
+// What it costs a ray to visit a wide node, to get to a leaf, and to test one or two blocks of it there.
+constexpr float kWideNodeCost = 1;
+constexpr float kLeafCost = 1;
+constexpr float kStepCost = 2;
+
 /// What a subtree costs the rays that meet it if it takes up to so many places among the children of a wide node, and
 /// how many wide nodes it then becomes. One place is entry kPlaces; entries below stand for none, and cost infinitely
 /// much.
@@ -29,7 +34,7 @@ struct SpreadPlan {
 };
 
 /// Kd nodes from `begin` to `end` that form one subtree.
-struct Run {
+struct KdRun {
     uint32_t begin;
     uint32_t end;
     Spread spread;  ///< once it is planned
@@ -51,9 +56,9 @@ class Collapse {
     Collapse(std::span<const KdNode> nodes, std::span<const TreePiece> pieces, std::span<SpreadPlan> plans)
         : nodes_(nodes), pieces_(pieces), plans_(plans) {}
 
-    void plan(Run& run) const;
+    void plan(KdRun& run) const;
     /// Plans the nodes above all these, which are planned.
-    void plan_above(std::span<const Run> runs) const;
+    void plan_above(std::span<const KdRun> runs) const;
 
     /// The wide nodes that a kd node becomes which is one itself.
     uint32_t wide_nodes(uint32_t node) const { return plans_[node].wide_nodes; }
@@ -61,7 +66,7 @@ class Collapse {
     /// first_block: added to the numbers of blocks.
     void write(const WideSubtree& subtree, uint32_t first_block, WideNode* wide) const;
     /// Writes the whole tree but for subtrees that lie in runs, which are returned.
-    std::vector<WideSubtree> write_above(std::span<const Run> runs, WideNode* wide) const;
+    std::vector<WideSubtree> write_above(std::span<const KdRun> runs, WideNode* wide) const;
 
  private:
     class Planner;

@@ -14,7 +14,7 @@ namespace {
 uint32_t run_length(size_t nodes) { return static_cast<uint32_t>(std::max<size_t>(512, nodes / 256)); }
 
 /// Lists the runs below a node in depth-first order.
-void find_runs(const Tree& tree, uint32_t begin, uint32_t end, uint32_t longest, std::vector<Run>& runs) {
+void find_runs(const Tree& tree, uint32_t begin, uint32_t end, uint32_t longest, std::vector<KdRun>& runs) {
     const KdNode node = tree.nodes[begin];
     if (node.is_leaf()) {
         return;  // the node above takes it as it is
@@ -56,7 +56,7 @@ void build_layout(const TriangleSoup& soup, std::span<const TreePiece> pieces, i
     if (blocks == 0) {
         return;
     }
-    std::vector<Run> runs;
+    std::vector<KdRun> runs;
     find_runs(tree, 0, nodes, run_length(nodes), runs);
 
     const std::vector<BlockTask> block_tasks = cut_to_tasks(pieces);

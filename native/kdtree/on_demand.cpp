@@ -256,7 +256,7 @@ uint32_t OnDemand::build_whole(const OpenNode& node, Scratch& scratch) {
     }
     kernels_.write_blocks(soup_, classes_, output.triangles().data(), blocks, blocks_ + first_block);
 
-    Run whole{0, static_cast<uint32_t>(output.node_count()), {}};
+    KdRun whole{0, static_cast<uint32_t>(output.node_count()), {}};
     scratch.plans.resize(std::max(scratch.plans.size(), output.node_count()));
     const TreePiece piece = output.whole();
     const Collapse collapse(output.nodes(), {&piece, 1}, scratch.plans);

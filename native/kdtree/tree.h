@@ -35,7 +35,7 @@ class BuildCancelled : public std::runtime_error {
 /// eight triangle tests (Wald and Havran 2006, with leaves that know they are tested eight at a time).
 struct SahConstants {
     double traversal = 15.0;
-    double block = 8.0;
+    double block = 6.0;
     double empty_bonus = 0.9;  ///< factor on splits that cut off empty space; not part of a reported cost
     int max_depth = 48;
 };
