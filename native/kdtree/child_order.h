@@ -46,7 +46,8 @@ class ChildOrder {
         }
     }
 
-    /// Fills in the orders of a node that has so many children, and its other places: where there are none, no ray gets.
+    /// Fills in the orders of a node that has so many children, and its other places: where there are none, no ray
+    /// gets.
     void write(size_t children, WideNode& node) const {
         for (size_t slot = children; slot < WideNode::kWidth; ++slot) {
             set_box(node, slot, {});

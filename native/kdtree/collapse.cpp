@@ -18,9 +18,17 @@ namespace hn = hwy::HWY_NAMESPACE;
 
 constexpr uint32_t kPlaces = Spread::kPlaces;
 
+/// Of a box whose sides are given in units of the tree's longest: its area, however large or small the scene is, is a
+/// number that sums of costs leave finite.
+float area_of(const Box3f& box, float unit) {
+    const Vec3f size = box.size() * unit;
+    return size.x * size.y + size.y * size.z + size.z * size.x;
+}
+
 /// A leaf or part of one.
 struct LeafPart {
     const TreePiece* piece;
+    float unit;  ///< see area_of
     uint32_t first_block;
     uint32_t blocks;
     uint32_t part;  ///< where the boxes of its own parts begin
@@ -53,11 +61,12 @@ struct LeafPart {
         }
         return right;
     }
-    float cost() const { return half_area(box) * (kLeafCost + kStepCost * static_cast<float>((blocks + 1) / 2)); }
+    float area() const { return area_of(box, unit); }
+    float cost() const { return area() * (kLeafCost + kStepCost * static_cast<float>((blocks + 1) / 2)); }
 };
 
-LeafPart whole_leaf(const KdNode& node, uint32_t index, const TreePiece& piece) {
-    return {&piece, node.first_block(), block_count(node.references()), node.first_block(), piece.box(index)};
+LeafPart whole_leaf(const KdNode& node, uint32_t index, const TreePiece& piece, float unit) {
+    return {&piece, unit, node.first_block(), block_count(node.references()), node.first_block(), piece.box(index)};
 }
 
 /// What takes one place however many there are.
@@ -96,7 +105,8 @@ class Shares {
         Best best{hn::Set(d, std::numeric_limits<float>::infinity()), hn::Zero(du), hn::Zero(du)};
         constexpr uint32_t kFirst = kPlaces + 4 * kHalf;
         for (uint32_t share = 1; share < 4 * (kHalf + 1); ++share) {
-            const auto cost = hn::Add(hn::Set(d, left.cost[kPlaces + share - 1]), hn::LoadU(d, right.cost + kFirst - share));
+            const auto cost =
+                hn::Add(hn::Set(d, left.cost[kPlaces + share - 1]), hn::LoadU(d, right.cost + kFirst - share));
             const auto nodes = hn::Add(hn::Set(du, left.wide_nodes[kPlaces + share - 1]),
                                        hn::LoadU(du, right.wide_nodes + kFirst - share));
             const auto is_better = hn::Lt(cost, best.cost);
@@ -160,7 +170,7 @@ void plan_leaf(const LeafPart& leaf, Spread& spread, SpreadPlan& plan) {
     plan_leaf(right, spreads[1], unused);
     const Shares shares(spreads[0], spreads[1]);
     if (leaf.is_long()) {
-        shares.take_node(half_area(leaf.box) * kWideNodeCost, spread, plan);
+        shares.take_node(leaf.area() * kWideNodeCost, spread, plan);
     } else {
         shares.take_leaf(leaf.cost(), spread, plan);
     }
@@ -179,7 +189,7 @@ class Collapse::Planner {
         piece_ = &collapse_.piece(node, *piece_);
         SpreadPlan& plan = collapse_.plans_[node];
         if (kd.is_leaf()) {
-            plan_leaf(whole_leaf(kd, node, *piece_), push(), plan);
+            plan_leaf(whole_leaf(kd, node, *piece_, collapse_.unit_), push(), plan);
             return;
         }
         const uint32_t left = node + 1;
@@ -192,7 +202,8 @@ class Collapse::Planner {
             plan = collapse_.plans_[left];
             of_right = of_left;
         } else {
-            Shares(of_left, of_right).take_node(half_area(piece_->box(node)) * kWideNodeCost, of_right, plan);
+            Shares(of_left, of_right)
+                .take_node(area_of(piece_->box(node), collapse_.unit_) * kWideNodeCost, of_right, plan);
         }
     }
 
@@ -230,7 +241,11 @@ class Collapse::Planner {
 class Collapse::Writer {
  public:
     Writer(const Collapse& collapse, uint32_t first_block, uint32_t place, WideNode* wide)
-        : collapse_(collapse), piece_(&collapse.pieces_.front()), first_block_(first_block), next_(place), wide_(wide) {}
+        : collapse_(collapse),
+          piece_(&collapse.pieces_.front()),
+          first_block_(first_block),
+          next_(place),
+          wide_(wide) {}
 
     /// Subtrees in these are left out.
     void leave(std::span<const KdRun> runs) { runs_ = runs; }
@@ -242,7 +257,7 @@ class Collapse::Writer {
         const KdNode kd = collapse_.nodes_[node];
         piece_ = &collapse_.piece(node, *piece_);
         if (kd.is_leaf()) {
-            return write(whole_leaf(kd, node, *piece_));
+            return write(whole_leaf(kd, node, *piece_, collapse_.unit_));
         }
         Row row(wide_[next_]);
         open(row, kd, node, 0, kPlaces, collapse_.plans_[node].left_places[0]);
@@ -304,7 +319,7 @@ class Collapse::Writer {
         piece_ = &collapse_.piece(node, *piece_);
         const uint32_t left_places = places == 1 ? 0 : collapse_.plans_[node].left_places[places - 1];
         if (kd.is_leaf()) {
-            const LeafPart leaf = whole_leaf(kd, node, *piece_);
+            const LeafPart leaf = whole_leaf(kd, node, *piece_, collapse_.unit_);
             left_places == 0 ? take(row, leaf, slot) : open(row, leaf, slot, places, left_places);
         } else if (left_places == 0) {
             set_box(row.wide, slot, piece_->box(node));
@@ -356,8 +371,8 @@ class Collapse::Writer {
             row.below[row.below_count++] = {slot, 0, leaf};
         } else {
             // Where both halves of a split have lost all they had, no ray meets the box.
-            row.wide.child[slot] = leaf.blocks == 0 ? WideNode::leaf(0, 1)
-                                                    : WideNode::leaf(leaf.first_block + first_block_, leaf.blocks);
+            row.wide.child[slot] =
+                leaf.blocks == 0 ? WideNode::leaf(0, 1) : WideNode::leaf(leaf.first_block + first_block_, leaf.blocks);
         }
     }
 
@@ -392,6 +407,12 @@ class Collapse::Writer {
     std::span<const KdRun> runs_;
     std::vector<WideSubtree> left_;
 };
+
+Collapse::Collapse(std::span<const KdNode> nodes, std::span<const TreePiece> pieces, std::span<SpreadPlan> plans)
+    : nodes_(nodes), pieces_(pieces), plans_(plans) {
+    const Vec3f size = pieces.front().box(0).size();
+    unit_ = 1 / std::max({size.x, size.y, size.z, 0x1p-100F});
+}
 
 void Collapse::plan(KdRun& run) const {
     Planner planner(*this);

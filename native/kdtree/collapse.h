@@ -53,8 +53,7 @@ struct WideSubtree {
 class Collapse {
  public:
     /// plans: one for each node.
-    Collapse(std::span<const KdNode> nodes, std::span<const TreePiece> pieces, std::span<SpreadPlan> plans)
-        : nodes_(nodes), pieces_(pieces), plans_(plans) {}
+    Collapse(std::span<const KdNode> nodes, std::span<const TreePiece> pieces, std::span<SpreadPlan> plans);
 
     void plan(KdRun& run) const;
     /// Plans the nodes above all these, which are planned.
@@ -80,6 +79,7 @@ class Collapse {
     std::span<const KdNode> nodes_;
     std::span<const TreePiece> pieces_;
     std::span<SpreadPlan> plans_;
+    float unit_;  ///< of lengths: one over the tree's longest side
 };
 
 }  // namespace espalier

@@ -17,7 +17,8 @@ namespace {
 /// A kd-tree of any shape whose boxes are of any size: a collapse asks for nothing else.
 class RandomTree {
  public:
-    RandomTree(unsigned seed, uint32_t leaves, uint32_t most_blocks) : generator_(seed), most_blocks_(most_blocks) {
+    RandomTree(unsigned seed, uint32_t leaves, uint32_t most_blocks, float size = 1)
+        : generator_(seed), most_blocks_(most_blocks), size_(size) {
         add(leaves, 1);
         part_boxes_.resize(blocks_);
         for (Box3f& box : part_boxes_) {
@@ -79,7 +80,7 @@ class RandomTree {
     }
 
     Box3f random_box() {
-        std::uniform_real_distribution<float> at(0, 1);
+        std::uniform_real_distribution<float> at(0, size_);
         Box3f box;
         box.extend(Vec3f{at(generator_), at(generator_), at(generator_)});
         box.extend(Vec3f{at(generator_), at(generator_), at(generator_)});
@@ -88,6 +89,7 @@ class RandomTree {
 
     std::mt19937 generator_;
     uint32_t most_blocks_;
+    float size_;
     uint32_t blocks_ = 0;
     std::vector<Box3f> boxes_;
     std::vector<Box3f> part_boxes_;
@@ -236,6 +238,21 @@ TEST(Collapse, IsTheSameHoweverTheTreeIsCutIntoRuns) {
             EXPECT_EQ(std::memcmp(cut.data(), whole.data(), whole.size() * sizeof(WideNode)), 0)
                 << "seed " << seed << ", runs of " << longest;
         }
+    }
+}
+
+TEST(Collapse, IsTheSameInScenesOfAnySize) {
+    const auto children = [](float size) {
+        RandomTree tree(7, 300, 6, size);
+        std::vector<uint32_t> found;
+        for (const WideNode& node : written_at_once(tree)) {
+            found.insert(found.end(), std::begin(node.child), std::end(node.child));
+        }
+        return found;
+    };
+    const std::vector<uint32_t> usual = children(1);
+    for (const float size : {0x1p61F, 0x1p30F, 0x1p-30F, 0x1p-90F}) {  // exact, and so are areas in units of the tree
+        EXPECT_EQ(children(size), usual) << "size " << size;
     }
 }
 

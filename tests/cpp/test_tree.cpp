@@ -11,9 +11,9 @@
 
 #include "kdtree/build_kernels.h"
 #include "kdtree/candidate.h"
+#include "kdtree/child_order.h"
 #include "kdtree/size_class.h"
 #include "kdtree/traversal.h"
-#include "kdtree/child_order.h"
 #include "meshes.h"
 
 namespace espalier {
