@@ -62,7 +62,10 @@ struct LeafPart {
         return right;
     }
     float area() const { return area_of(box, unit); }
-    float cost() const { return area() * (kLeafCost + kStepCost * static_cast<float>((blocks + 1) / 2)); }
+    float cost() const {
+        const uint32_t steps = (blocks + 1) / 2;
+        return area() * (kLeafCost + kStepCost * static_cast<float>(steps));
+    }
 };
 
 LeafPart whole_leaf(const KdNode& node, uint32_t index, const TreePiece& piece, float unit) {
@@ -186,7 +189,7 @@ class Collapse::Planner {
 
     void plan(uint32_t node) {
         const KdNode kd = collapse_.nodes_[node];
-        piece_ = &collapse_.piece(node, *piece_);
+        piece_ = collapse_.piece_with(node, piece_);
         SpreadPlan& plan = collapse_.plans_[node];
         if (kd.is_leaf()) {
             plan_leaf(whole_leaf(kd, node, *piece_, collapse_.unit_), push(), plan);
@@ -255,7 +258,7 @@ class Collapse::Writer {
     uint32_t write(uint32_t node) {
         node = with_all(node);
         const KdNode kd = collapse_.nodes_[node];
-        piece_ = &collapse_.piece(node, *piece_);
+        piece_ = collapse_.piece_with(node, piece_);
         if (kd.is_leaf()) {
             return write(whole_leaf(kd, node, *piece_, collapse_.unit_));
         }
@@ -316,7 +319,7 @@ class Collapse::Writer {
     void place(Row& row, uint32_t node, size_t slot, uint32_t places) {
         node = with_all(node);
         const KdNode kd = collapse_.nodes_[node];
-        piece_ = &collapse_.piece(node, *piece_);
+        piece_ = collapse_.piece_with(node, piece_);
         const uint32_t left_places = places == 1 ? 0 : collapse_.plans_[node].left_places[places - 1];
         if (kd.is_leaf()) {
             const LeafPart leaf = whole_leaf(kd, node, *piece_, collapse_.unit_);

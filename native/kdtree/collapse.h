@@ -72,8 +72,9 @@ class Collapse {
     class Writer;
 
     bool is_empty(uint32_t node) const { return nodes_[node].is_leaf() && nodes_[node].references() == 0; }
-    const TreePiece& piece(uint32_t node, const TreePiece& near) const {
-        return near.holds(node) ? near : piece_of(pieces_, node);
+    /// near: the one that most likely holds the node.
+    const TreePiece* piece_with(uint32_t node, const TreePiece* near) const {
+        return near->holds(node) ? near : &piece_of(pieces_, node);
     }
 
     std::span<const KdNode> nodes_;
