@@ -10,11 +10,9 @@
 
 namespace espalier {
 
-/// Surface area of a box, halved.
-inline float half_area(const Box3f& box) {
-    const Vec3f size = box.size();
-    return size.x * size.y + size.y * size.z + size.z * size.x;
-}
+/// Surface area of a box of this size, halved.
+inline float half_area(Vec3f size) { return size.x * size.y + size.y * size.z + size.z * size.x; }
+inline float half_area(const Box3f& box) { return half_area(box.size()); }
 
 inline void set_box(WideNode& node, size_t slot, const Box3f& box) {
     for (int axis = 0; axis < 3; ++axis) {

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 #include "kdtree/collapse.h"
 
-#include <hwy/highway.h>
-
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -10,6 +8,11 @@
 #include <utility>
 
 #include "kdtree/child_order.h"
+#include "kdtree/simd_config.h"
+
+// clang-format off: behind its configuration
+#include <hwy/highway.h>
+// clang-format on
 
 namespace espalier {
 namespace {
@@ -18,12 +21,7 @@ namespace hn = hwy::HWY_NAMESPACE;
 
 constexpr uint32_t kPlaces = Spread::kPlaces;
 
-/// Of a box whose sides are given in units of the tree's longest: its area, however large or small the scene is, is a
-/// number that sums of costs leave finite.
-float area_of(const Box3f& box, float unit) {
-    const Vec3f size = box.size() * unit;
-    return size.x * size.y + size.y * size.z + size.z * size.x;
-}
+float area_of(const Box3f& box, float unit) { return half_area(box.size() * unit); }
 
 /// A leaf or part of one.
 struct LeafPart {
@@ -153,8 +151,13 @@ Spread new_spread() {
 }
 
 void plan_leaf(const LeafPart& leaf, Spread& spread, SpreadPlan& plan) {
+    if (leaf.blocks == 0) {
+        take_one_place(0, spread, plan);
+        plan.wide_nodes = 0;
+        return;
+    }
     if (!leaf.is_divisible()) {
-        take_one_place(leaf.blocks == 0 ? 0 : leaf.cost(), spread, plan);
+        take_one_place(leaf.cost(), spread, plan);
         return;
     }
     const LeafPart left = leaf.left();
@@ -373,7 +376,7 @@ class Collapse::Writer {
         if (leaf.is_long()) {
             row.below[row.below_count++] = {slot, 0, leaf};
         } else {
-            // Where both halves of a split have lost all they had, no ray meets the box.
+            // Only a subtree that has lost all it had is a leaf of nothing, and no ray meets its box.
             row.wide.child[slot] =
                 leaf.blocks == 0 ? WideNode::leaf(0, 1) : WideNode::leaf(leaf.first_block + first_block_, leaf.blocks);
         }
@@ -414,7 +417,7 @@ class Collapse::Writer {
 Collapse::Collapse(std::span<const KdNode> nodes, std::span<const TreePiece> pieces, std::span<SpreadPlan> plans)
     : nodes_(nodes), pieces_(pieces), plans_(plans) {
     const Vec3f size = pieces.front().box(0).size();
-    unit_ = 1 / std::max({size.x, size.y, size.z, 0x1p-100F});
+    unit_ = 0x1p45F / std::max({size.x, size.y, size.z, 0x1p-80F});
 }
 
 void Collapse::plan(KdRun& run) const {

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 #pragma once
 
+#include <algorithm>
 #include <cstddef>
 #include <cstdint>
 #include <span>
@@ -28,9 +29,10 @@ struct Spread {
 /// How a kd node is best spread.
 struct SpreadPlan {
     /// By the number of places less 1: those of them that its left part gets, the right one taking the rest; 0 where it
-    /// takes one place itself. The first is for all places, where it is a wide node itself.
+    /// takes one place itself. The first is for all places, where it becomes a wide node, as inner nodes and very long
+    /// leaves do.
     uint8_t left_places[Spread::kPlaces];
-    uint32_t wide_nodes;  ///< where it is one itself: that and those below
+    uint32_t wide_nodes;  ///< where it becomes one: that and those below; 0 if nothing is in it
 };
 
 /// Kd nodes from `begin` to `end` that form one subtree.
@@ -59,8 +61,8 @@ class Collapse {
     /// Plans the nodes above all these, which are planned.
     void plan_above(std::span<const KdRun> runs) const;
 
-    /// The wide nodes that a kd node becomes which is one itself.
-    uint32_t wide_nodes(uint32_t node) const { return plans_[node].wide_nodes; }
+    /// How many wide nodes a kd node that becomes one and those below it come to.
+    uint32_t wide_nodes(uint32_t node) const { return std::max(1U, plans_[node].wide_nodes); }
 
     /// first_block: added to the numbers of blocks.
     void write(const WideSubtree& subtree, uint32_t first_block, WideNode* wide) const;
@@ -71,7 +73,8 @@ class Collapse {
     class Planner;
     class Writer;
 
-    bool is_empty(uint32_t node) const { return nodes_[node].is_leaf() && nodes_[node].references() == 0; }
+    /// Whether nothing is in a node, once it is planned: both halves of a split may lose all they had to rounding.
+    bool is_empty(uint32_t node) const { return plans_[node].wide_nodes == 0; }
     /// near: the one that most likely holds the node.
     const TreePiece* piece_with(uint32_t node, const TreePiece* near) const {
         return near->holds(node) ? near : &piece_of(pieces_, node);
@@ -80,7 +83,9 @@ class Collapse {
     std::span<const KdNode> nodes_;
     std::span<const TreePiece> pieces_;
     std::span<SpreadPlan> plans_;
-    float unit_;  ///< of lengths: one over the tree's longest side
+    /// What lengths are multiplied by, so that in scenes of any size areas neither vanish nor add up to infinity: the
+    /// tree's longest side becomes 2^45, and the longest leaf 2^26 blocks of 3 * 2^90.
+    float unit_;
 };
 
 }  // namespace espalier

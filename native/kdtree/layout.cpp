@@ -17,7 +17,7 @@ uint32_t run_length(size_t nodes) { return static_cast<uint32_t>(std::max<size_t
 void find_runs(const Tree& tree, uint32_t begin, uint32_t end, uint32_t longest, std::vector<KdRun>& runs) {
     const KdNode node = tree.nodes[begin];
     if (node.is_leaf()) {
-        return;  // the node above takes it as it is
+        return;  // planned with the nodes above
     }
     if (end - begin <= longest) {
         runs.push_back({begin, end, {}});

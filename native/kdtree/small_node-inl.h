@@ -201,7 +201,7 @@ class SmallNode {
     /// Builds below a set of references; returns the cost of what was built, per ray that meets the cell.
     float split(const Members<kWords>& members, const OpenNode& node) {
         const float leaf_cost = block_cost_ * static_cast<float>(block_count(node.count));
-        // A leaf of one block is cheaper than any step.
+        // A leaf of so few blocks is cheaper than any step.
         if (leaf_cost <= traversal_cost_ || node.depth >= parameters_.sah.max_depth) {
             write_leaf(members, node);
             return leaf_cost;

@@ -2,6 +2,7 @@
 #include <gtest/gtest.h>
 
 #include <algorithm>
+#include <functional>
 #include <iterator>
 #include <limits>
 #include <random>
@@ -259,6 +260,47 @@ TEST(Collapse, IsTheSameInScenesOfAnySize) {
     for (const float size : {0x1p61F, 0x1p30F, 0x1p-30F, 0x1p-90F}) {  // exact, and so are areas in units of the tree
         EXPECT_EQ(children(size), usual) << "size " << size;
     }
+}
+
+TEST(Collapse, IsTheSameWhereTheTreeIsFarLargerThanAllBelow) {
+    const auto children = [](float root_size) {
+        RandomTree tree(7, 300, 6);
+        tree.piece_.box(0) = {{0, 0, 0}, {root_size, root_size, root_size}};
+        std::vector<uint32_t> found;
+        for (const WideNode& node : written_at_once(tree)) {
+            found.insert(found.end(), std::begin(node.child), std::end(node.child));
+        }
+        return found;
+    };
+    EXPECT_EQ(children(0x1p75F), children(1));
+}
+
+TEST(Collapse, GivesNoPlaceToWhatHasLostAllItHad) {
+    std::vector<KdNode> nodes{KdNode::inner(0, 0, 2), KdNode::leaf(0, kBlockSize)};
+    const std::function<void(int)> add_nothing = [&](int levels) {
+        const size_t index = nodes.size();
+        nodes.push_back(KdNode::leaf(1, 0));
+        if (levels > 0) {
+            add_nothing(levels - 1);
+            nodes[index] = KdNode::inner(0, 0, static_cast<uint32_t>(nodes.size()));
+            add_nothing(levels - 1);
+        }
+    };
+    add_nothing(5);
+    std::vector<Box3f> boxes(nodes.size());
+    boxes[0] = boxes[1] = {{0, 0, 0}, {1, 1, 1}};
+    const std::vector<Box3f> part_boxes(1);
+    const TreePiece piece{0, 0, boxes, part_boxes, {}};
+    std::vector<SpreadPlan> plans(nodes.size());
+    const Collapse collapse(nodes, {&piece, 1}, plans);
+    KdRun whole{0, static_cast<uint32_t>(nodes.size()), {}};
+    collapse.plan(whole);
+    ASSERT_EQ(collapse.wide_nodes(0), 1U);
+    WideNode wide;
+    collapse.write({0, 0, 1}, 0, &wide);
+    EXPECT_EQ(wide.child[0], WideNode::leaf(0, 1));
+    EXPECT_EQ(wide.upper[0][0], 1);
+    EXPECT_LT(wide.upper[0][1], wide.lower[0][1]);
 }
 
 TEST(Collapse, CutsLeavesThatAreTooLongForAChild) {
