@@ -14,6 +14,7 @@
 #include <hwy/highway.h>
 // clang-format on
 
+HWY_BEFORE_NAMESPACE();
 namespace espalier {
 namespace {
 
@@ -445,3 +446,4 @@ std::vector<WideSubtree> Collapse::write_above(std::span<const KdRun> runs, Wide
 }
 
 }  // namespace espalier
+HWY_AFTER_NAMESPACE();
