@@ -183,6 +183,13 @@ void plan_leaf(const LeafPart& leaf, Spread& spread, SpreadPlan& plan) {
     }
 }
 
+SpreadPlan plan_of(const LeafPart& leaf) {
+    Spread unused;
+    SpreadPlan plan;
+    plan_leaf(leaf, unused, plan);
+    return plan;
+}
+
 }  // namespace
 
 /// Plans nodes from the last to the first, and so a node when both its parts are planned. Their spreads lie on a stack.
@@ -254,9 +261,9 @@ class Collapse::Writer {
           next_(place),
           wide_(wide) {}
 
-    /// Subtrees in these are left out.
-    void leave(std::span<const KdRun> runs) { runs_ = runs; }
-    const std::vector<WideSubtree>& left() const { return left_; }
+    /// Leaves out subtrees in these.
+    void skip(std::span<const KdRun> runs) { runs_ = runs; }
+    const std::vector<WideSubtree>& skipped() const { return skipped_; }
 
     /// Writes the wide node that a kd node becomes, and those below it.
     uint32_t write(uint32_t node) {
@@ -291,10 +298,7 @@ class Collapse::Writer {
     uint32_t write(const LeafPart& leaf) {
         Row row(wide_[next_]);
         if (leaf.is_long()) {
-            Spread spread;
-            SpreadPlan plan;
-            plan_leaf(leaf, spread, plan);
-            open(row, leaf, 0, kPlaces, plan.left_places[0]);
+            open(row, leaf, 0, kPlaces, plan_of(leaf).left_places[0]);
         } else {  // the whole tree
             place(row, leaf, 0, kPlaces);
         }
@@ -304,14 +308,14 @@ class Collapse::Writer {
     uint32_t finish(Row& row) {
         row.order.write(row.count, row.wide);
         const uint32_t place = next_++;
-        for (const typename Row::Below& below : std::span(row.below).first(row.below_count)) {
+        for (const Row::Below& below : std::span(row.below).first(row.below_count)) {
             uint32_t& child = row.wide.child[below.slot];
             if (below.leaf.blocks != 0) {
                 child = write(below.leaf);
-            } else if (is_left(below.node)) {
+            } else if (is_skipped(below.node)) {
                 child = next_;
-                left_.push_back({below.node, next_, collapse_.wide_nodes(below.node)});
-                next_ += left_.back().count;
+                skipped_.push_back({below.node, next_});
+                next_ += collapse_.wide_nodes(below.node);
             } else {
                 child = write(below.node);
             }
@@ -344,16 +348,9 @@ class Collapse::Writer {
 
     /// The same for parts of leaves.
     void place(Row& row, const LeafPart& leaf, size_t slot, uint32_t places) {
-        if (places > 1 && leaf.is_divisible()) {
-            Spread spread;
-            SpreadPlan plan;
-            plan_leaf(leaf, spread, plan);
-            if (plan.left_places[places - 1] != 0) {
-                open(row, leaf, slot, places, plan.left_places[places - 1]);
-                return;
-            }
-        }
-        take(row, leaf, slot);
+        const bool may_open = places > 1 && leaf.is_divisible();
+        const uint32_t left_places = may_open ? plan_of(leaf).left_places[places - 1] : 0;
+        left_places == 0 ? take(row, leaf, slot) : open(row, leaf, slot, places, left_places);
     }
     void open(Row& row, const LeafPart& leaf, size_t slot, uint32_t places, uint32_t left_places) {
         const LeafPart left = leaf.left();
@@ -400,7 +397,7 @@ class Collapse::Writer {
         }
     }
 
-    bool is_left(uint32_t node) const {
+    bool is_skipped(uint32_t node) const {
         const auto after = std::upper_bound(runs_.begin(), runs_.end(), node,
                                             [](uint32_t n, const KdRun& run) { return n < run.begin; });
         return after != runs_.begin() && node < (after - 1)->end;
@@ -412,7 +409,7 @@ class Collapse::Writer {
     uint32_t next_;
     WideNode* wide_;
     std::span<const KdRun> runs_;
-    std::vector<WideSubtree> left_;
+    std::vector<WideSubtree> skipped_;
 };
 
 Collapse::Collapse(std::span<const KdNode> nodes, std::span<const TreePiece> pieces, std::span<SpreadPlan> plans)
@@ -437,12 +434,12 @@ void Collapse::write(const WideSubtree& subtree, uint32_t first_block, WideNode*
 
 std::vector<WideSubtree> Collapse::write_above(std::span<const KdRun> runs, WideNode* wide) const {
     if (runs.size() == 1 && runs.front().begin == 0) {
-        return {{0, 0, wide_nodes(0)}};
+        return {{0, 0}};
     }
     Writer writer(*this, 0, 0, wide);
-    writer.leave(runs);
+    writer.skip(runs);
     writer.write(0);
-    return writer.left();
+    return writer.skipped();
 }
 
 }  // namespace espalier

@@ -46,7 +46,6 @@ struct KdRun {
 struct WideSubtree {
     uint32_t node;
     uint32_t place;  ///< of the first
-    uint32_t count;
 };
 
 /// Chooses which nodes of a finished kd-tree, and which parts of its leaves, become children of wide nodes: of all ways

@@ -77,8 +77,9 @@ void build_layout(const TriangleSoup& soup, std::span<const TreePiece> pieces, i
     tree.wide_nodes = LargeBuffer<WideNode>(collapse.wide_nodes(0));
     const std::vector<WideSubtree> subtrees = collapse.write_above(runs, tree.wide_nodes.data());
     parallel_for(threads, subtrees.size(), [&](size_t i) {
-        tree.wide_nodes.take_pages(subtrees[i].place, subtrees[i].place + subtrees[i].count);
-        collapse.write(subtrees[i], 0, tree.wide_nodes.data());
+        const WideSubtree& subtree = subtrees[i];
+        tree.wide_nodes.take_pages(subtree.place, subtree.place + collapse.wide_nodes(subtree.node));
+        collapse.write(subtree, 0, tree.wide_nodes.data());
     });
 }
 

@@ -261,9 +261,8 @@ uint32_t OnDemand::build_whole(const OpenNode& node, Scratch& scratch) {
     const TreePiece piece = output.whole();
     const Collapse collapse(output.nodes(), {&piece, 1}, scratch.plans);
     collapse.plan(whole);
-    const uint32_t count = collapse.wide_nodes(0);
-    const uint32_t first = add_nodes(count);
-    collapse.write({0, first, count}, static_cast<uint32_t>(first_block), nodes_);
+    const uint32_t first = add_nodes(collapse.wide_nodes(0));
+    collapse.write({0, first}, static_cast<uint32_t>(first_block), nodes_);
     return first;
 }
 

@@ -107,7 +107,7 @@ std::vector<WideNode> written_at_once(RandomTree& tree) {
     collapse.plan(whole);
     std::vector<WideNode> wide(collapse.wide_nodes(0) + 1);
     const WideNode untouched = wide.back();
-    collapse.write({0, 0, collapse.wide_nodes(0)}, 0, wide.data());
+    collapse.write({0, 0}, 0, wide.data());
     EXPECT_TRUE(same_bytes(std::span(&wide.back(), 1), std::span(&untouched, 1)));
     wide.pop_back();
     return wide;
@@ -125,6 +125,14 @@ std::vector<WideNode> written_in_runs(RandomTree& tree, uint32_t longest) {
         collapse.write(subtree, 0, wide.data());
     }
     return wide;
+}
+
+std::vector<uint32_t> children_of(const std::vector<WideNode>& wide) {
+    std::vector<uint32_t> found;
+    for (const WideNode& node : wide) {
+        found.insert(found.end(), std::begin(node.child), std::end(node.child));
+    }
+    return found;
 }
 
 float leaf_cost(const Box3f& box, uint32_t blocks) {
@@ -250,11 +258,7 @@ TEST(Collapse, IsTheSameHoweverTheTreeIsCutIntoRuns) {
 TEST(Collapse, IsTheSameInScenesOfAnySize) {
     const auto children = [](float size) {
         RandomTree tree(7, 300, 6, size);
-        std::vector<uint32_t> found;
-        for (const WideNode& node : written_at_once(tree)) {
-            found.insert(found.end(), std::begin(node.child), std::end(node.child));
-        }
-        return found;
+        return children_of(written_at_once(tree));
     };
     const std::vector<uint32_t> usual = children(1);
     for (const float size : {0x1p61F, 0x1p30F, 0x1p-30F, 0x1p-90F}) {  // exact, and so are areas in units of the tree
@@ -266,11 +270,7 @@ TEST(Collapse, IsTheSameWhereTheTreeIsFarLargerThanAllBelow) {
     const auto children = [](float root_size) {
         RandomTree tree(7, 300, 6);
         tree.piece_.box(0) = {{0, 0, 0}, {root_size, root_size, root_size}};
-        std::vector<uint32_t> found;
-        for (const WideNode& node : written_at_once(tree)) {
-            found.insert(found.end(), std::begin(node.child), std::end(node.child));
-        }
-        return found;
+        return children_of(written_at_once(tree));
     };
     EXPECT_EQ(children(0x1p75F), children(1));
 }
@@ -297,7 +297,7 @@ TEST(Collapse, GivesNoPlaceToWhatHasLostAllItHad) {
     collapse.plan(whole);
     ASSERT_EQ(collapse.wide_nodes(0), 1U);
     WideNode wide;
-    collapse.write({0, 0, 1}, 0, &wide);
+    collapse.write({0, 0}, 0, &wide);
     EXPECT_EQ(wide.child[0], WideNode::leaf(0, 1));
     EXPECT_EQ(wide.upper[0][0], 1);
     EXPECT_LT(wide.upper[0][1], wide.lower[0][1]);
@@ -314,7 +314,7 @@ TEST(Collapse, CutsLeavesThatAreTooLongForAChild) {
         KdRun whole{0, 1, {}};
         collapse.plan(whole);
         std::vector<WideNode> wide(collapse.wide_nodes(0));
-        collapse.write({0, 0, collapse.wide_nodes(0)}, 100, wide.data());
+        collapse.write({0, 0}, 100, wide.data());
         std::vector<bool> found(blocks);
         for (const WideNode& node : wide) {
             for (int i = 0; i < WideNode::kWidth; ++i) {
