@@ -70,7 +70,7 @@ class Builder {
             make_references_alone(subtrees);
             phases.bounds = watch.lap();
         } else {
-            top.emplace(soup_, parameters_, cancel_, threads_);
+            top.emplace(soup_, parameters_, cancel_, threads_, LaterUse::kSubtreesAndBlocks);
             top->make_references(&*memory);
             phases.bounds = watch.lap();
             tree_.report.rejected_faces = top->rejected();

@@ -29,7 +29,7 @@ OnDemand::OnDemand(const TriangleSoup& soup, const BuildParameters& parameters, 
     : soup_(soup),
       parameters_(parameters),
       kernels_(build_kernels()),
-      top_(soup_, parameters_, cancel, threads),
+      top_(soup_, parameters_, cancel, threads, LaterUse::kNone),
       threads_(threads),
       whole_(std::max(kWhole, parameters.one_thread)),
       memory_(size_t{2} * soup.size() + kWhole, 0, SIZE_MAX),
@@ -154,7 +154,7 @@ uint32_t OnDemand::build(Part& part) {
     }
     const bool has_places = part_count_.load(std::memory_order_relaxed) + 256 * WideNode::kWidth < most_parts_;
     const uint32_t code =
-        part.node.count > whole_ && has_places ? divide(part.node, *scratch) : build_whole(part.node, *scratch);
+        part.node.count > whole_ && has_places ? divide(part, *scratch) : build_whole(part.node, *scratch);
     const std::lock_guard lock(scratch_mutex_);
     scratch_.push_back(std::move(scratch));
     return code;
@@ -172,7 +172,8 @@ std::unique_ptr<OnDemand::Scratch> OnDemand::take_scratch() {
 
 /// Splits a node into the children of one wide node, which wait to be opened. Left children stay where their parent's
 /// references lie in the scratch room, right ones go behind all others.
-uint32_t OnDemand::divide(const OpenNode& node, Scratch& scratch) {
+uint32_t OnDemand::divide(const Part& part, Scratch& scratch) {
+    const OpenNode& node = part.node;
     struct Item {
         OpenNode node;
         size_t begin;
@@ -222,19 +223,17 @@ uint32_t OnDemand::divide(const OpenNode& node, Scratch& scratch) {
         return build_whole(items[0].node, scratch);
     }
 
-    size_t references = 0;
-    for (const Item& item : std::span(items).first(count)) {
-        references += item.node.count;
-    }
-    const References memory = memory_.take(static_cast<uint32_t>(references + ReferenceBuffer::kSlack));
     const uint32_t index = add_nodes(1);
     WideNode& wide = nodes_[index];
     order.write(count, wide);
-    size_t begin = 0;
+    // Children lie where their parent lay as far as there is room: memory that was in use is in the cache, and cleared.
+    uint32_t free = part.top == nullptr ? node.count : 0;
     for (size_t i = 0; i < count; ++i) {
-        const References place = memory.at(begin);
-        copy_references(at(items[i].begin), items[i].node.count, place);
-        begin += items[i].node.count;
+        const uint32_t references = items[i].node.count;
+        const bool fits = references <= free;
+        const References place = fits ? part.references.at(node.count - free) : memory_.take(references);
+        free -= fits ? references : 0;
+        copy_references(at(items[i].begin), references, place);
         set_box(wide, i, items[i].node.tight);
         wide.child[i] = new_part(items[i].node, nullptr, place);
     }

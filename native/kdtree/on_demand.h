@@ -57,7 +57,7 @@ class OnDemand {
     uint32_t new_part(const OpenNode& node, const TopNode* top, const References& references);
     uint32_t build(Part& part);
     std::unique_ptr<Scratch> take_scratch();
-    uint32_t divide(const OpenNode& node, Scratch& scratch);
+    uint32_t divide(const Part& part, Scratch& scratch);
     uint32_t build_whole(const OpenNode& node, Scratch& scratch);
     uint32_t add_nodes(uint32_t count);
 

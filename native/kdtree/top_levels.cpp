@@ -20,6 +20,11 @@ uint32_t choose_segment_size(uint32_t triangles, int threads) {
 constexpr uint32_t kMargin = 16;
 uint32_t with_slack(uint32_t count) { return count + count / 4 + 2 * kMargin; }
 
+/// References that the top usually makes, or for what is done behind it.
+size_t places_for(uint32_t triangles, LaterUse later_use) {
+    return triangles + (later_use == LaterUse::kNone ? size_t{triangles} / 4 : size_t{3} * triangles / 2);
+}
+
 void add(const BinCounts& part, BinCounts& sum) {
     for (int axis = 0; axis < 3; ++axis) {
         for (int j = 0; j < kPlanes; ++j) {
@@ -42,7 +47,7 @@ References SegmentMemory::take(uint32_t count) {
 }
 
 TopLevels::TopLevels(const TriangleSoup& soup, const BuildParameters& parameters, const std::atomic<bool>* cancel,
-                     int threads)
+                     int threads, LaterUse later_use)
     : soup_(soup),
       parameters_(parameters),
       cancel_(cancel),
@@ -50,8 +55,11 @@ TopLevels::TopLevels(const TriangleSoup& soup, const BuildParameters& parameters
       kernels_(build_kernels()),
       is_large_(is_large(soup, parameters)),
       segment_size_(choose_segment_size(soup.size(), threads)),
-      memory_(size_t{5} * soup.size() / 2 + size_t{2} * with_slack(segment_size_) * static_cast<size_t>(threads + 1),
-              most_block_bytes(soup.size()), usual_block_bytes(soup.size())),
+      later_bytes_(later_use == LaterUse::kNone ? 0 : usual_block_bytes(soup.size())),
+      memory_(
+          places_for(soup.size(), later_use) + size_t{2} * with_slack(segment_size_) * static_cast<size_t>(threads + 1),
+          later_use == LaterUse::kNone ? 0 : most_block_bytes(soup.size()),
+          later_use == LaterUse::kNone ? SIZE_MAX : later_bytes_),
       scratch_(static_cast<size_t>(threads)) {}
 
 void TopLevels::make_references(TransientMemory* transient) {
@@ -90,7 +98,7 @@ void TopLevels::make_references(TransientMemory* transient) {
 void TopLevels::take_pages(TransientMemory* transient) {
     constexpr size_t kPage = LargeBuffer<uint32_t>::kHugePage / sizeof(uint32_t);
     ReferenceBuffer& places = memory_.first();
-    const size_t words = std::max(usual_block_bytes(soup_.size()) / sizeof(uint32_t), places.words());
+    const size_t words = std::max(later_bytes_ / sizeof(uint32_t), places.words());
     const bool is_shared = transient != nullptr && transient->huge_pages() <= static_cast<size_t>(threads_);
     const size_t others = is_shared ? transient->huge_pages() : 0;
     parallel_for(threads_, others + words / kPage + 1, [&](size_t i) {

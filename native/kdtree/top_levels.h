@@ -54,11 +54,14 @@ struct UsedReferences {
     size_t used;
 };
 
+/// What else will lie in the memory of the top's references.
+enum class LaterUse { kNone, kSubtreesAndBlocks };
+
 /// Phases 1 and 2: the references and the top of the tree, all threads on one level at a time.
 class TopLevels {
  public:
-    TopLevels(const TriangleSoup& soup, const BuildParameters& parameters, const std::atomic<bool>* cancel,
-              int threads);
+    TopLevels(const TriangleSoup& soup, const BuildParameters& parameters, const std::atomic<bool>* cancel, int threads,
+              LaterUse later_use);
 
     /// Phase 1: boxes of all faces that can be hit. Those of a large scene are sorted as they are made by the leaves of
     /// a multiway split, so that they go through memory once. transient: whose huge pages are taken as well, if few.
@@ -105,6 +108,7 @@ class TopLevels {
     const BuildKernels& kernels_;
     const bool is_large_;  ///< whether the root is split several levels at once, if it can be
     const uint32_t segment_size_;
+    const size_t later_bytes_;  ///< that are usually in use later
     SegmentMemory memory_;
     SortedNode root_;  ///< of one leaf, if the scene is not sorted
     std::vector<TopNode> nodes_;
