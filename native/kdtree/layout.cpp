@@ -47,6 +47,12 @@ std::vector<BlockTask> cut_to_tasks(std::span<const TreePiece> pieces) {
     return tasks;
 }
 
+/// All threads together: the first node of each run lies on another page, and one thread writes them all.
+void take_huge_pages(LargeBuffer<WideNode>& nodes, int threads) {
+    constexpr size_t kPage = LargeBuffer<WideNode>::kHugePage / sizeof(WideNode);
+    parallel_for(threads, nodes.size() / kPage, [&](size_t i) { nodes.take_pages(i * kPage, (i + 1) * kPage); });
+}
+
 }  // namespace
 
 void build_layout(const TriangleSoup& soup, std::span<const TreePiece> pieces, int threads, TransientMemory& memory,
@@ -75,6 +81,7 @@ void build_layout(const TriangleSoup& soup, std::span<const TreePiece> pieces, i
 
     collapse.plan_above(runs);
     tree.wide_nodes = LargeBuffer<WideNode>(collapse.wide_nodes(0));
+    take_huge_pages(tree.wide_nodes, threads);
     const std::vector<WideSubtree> subtrees = collapse.write_above(runs, tree.wide_nodes.data());
     parallel_for(threads, subtrees.size(), [&](size_t i) {
         const WideSubtree& subtree = subtrees[i];
