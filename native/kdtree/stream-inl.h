@@ -234,8 +234,8 @@ class Stream {
     }
 
  private:
-    /// So many that, with what is noted of them, they fit into a processor's first cache of 32 KiB.
-    static constexpr uint32_t kInFlight = 24;
+    /// So many that, with what is noted of them and fetched for them, they fit into a processor's first cache of 32 KiB.
+    static constexpr uint32_t kInFlight = kBlocksPerStep == 2 ? 22 : 24;
     /// Bytes of nodes and blocks that processors keep so near that fetching ahead costs more than it gains.
     static constexpr size_t kCached = size_t{10} << 20;
     /// Of 64 bytes, from where a ray goes on. A node has four, a block five.
