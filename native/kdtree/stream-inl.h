@@ -234,12 +234,15 @@ class Stream {
     }
 
  private:
-    /// So many that, with what is noted of them and fetched for them, they fit into a processor's first cache of 32 KiB.
-    static constexpr uint32_t kInFlight = kBlocksPerStep == 2 ? 22 : 24;
+    /// So many that, with what is noted of them and fetched for them, they fit into a processor's first cache of 32
+    /// KiB.
+    static constexpr uint32_t kInFlight = 24;
     /// Bytes of nodes and blocks that processors keep so near that fetching ahead costs more than it gains.
     static constexpr size_t kCached = size_t{10} << 20;
-    /// Of 64 bytes, from where a ray goes on. A node has four, a block five.
-    static constexpr int kLinesFetched = kBlocksPerStep == 2 ? 8 : 5;
+    /// Lines of 64 bytes that are fetched of a node, and of a leaf from where a ray goes on, of whose blocks each has
+    /// five.
+    static constexpr int kLinesOfNode = sizeof(WideNode) / 64;
+    static constexpr int kLinesOfLeaf = kBlocksPerStep == 2 ? 8 : 5;
 
     /// How many rays are on each list. Not beside the lists: what is written to those and to rays might be these, for
     /// all a compiler knows, and they would be read back at every step.
@@ -350,8 +353,13 @@ class Stream {
         // A choice that compilers would make with a branch.
         const auto* wanted = reinterpret_cast<const char*>(  // NOLINT(performance-no-int-to-ptr)
             node ^ ((node ^ block) & (uintptr_t{0} - is_leaf)));
-        for (int line = 0; line < kLinesFetched; ++line) {
+        for (int line = 0; line < kLinesOfNode; ++line) {
             __builtin_prefetch(wanted + 64 * line);
+        }
+        // More of a leaf; the same lines of a node, which costs next to nothing.
+        const char* more = wanted + 64 * kLinesOfNode * is_leaf;
+        for (int line = 0; line < kLinesOfLeaf - kLinesOfNode; ++line) {
+            __builtin_prefetch(more + 64 * line);
         }
     }
 
