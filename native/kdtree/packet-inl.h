@@ -511,13 +511,19 @@ class Packet {
         return 0;
     }
 
+    /// A node, or the first two blocks of a leaf.
     HWY_INLINE void prefetch(uint32_t place) const {
         const uint32_t child = nodes_[place / WideNode::kWidth].child[place % WideNode::kWidth];
-        const char* wanted = (child & WideNode::kLeafFlag) != 0
-                                 ? reinterpret_cast<const char*>(blocks_ + WideNode::first_block(child))
-                                 : reinterpret_cast<const char*>(nodes_ + child);
-        for (int line = 0; line < 4; ++line) {
-            __builtin_prefetch(wanted + 64 * line);
+        if ((child & WideNode::kLeafFlag) != 0) {
+            const auto* blocks = reinterpret_cast<const char*>(blocks_ + WideNode::first_block(child));
+            for (size_t byte = 0; byte < 2 * sizeof(TriangleBlock); byte += 64) {
+                __builtin_prefetch(blocks + byte);
+            }
+        } else {
+            const auto* node = reinterpret_cast<const char*>(nodes_ + child);
+            for (size_t byte = 0; byte < sizeof(WideNode); byte += 64) {
+                __builtin_prefetch(node + byte);
+            }
         }
     }
 
