@@ -18,6 +18,7 @@
 
 #include "kdtree/candidate.h"
 #include "kdtree/focus_view-inl.h"
+#include "kdtree/mailboxes.h"
 #include "kdtree/on_demand.h"
 #include "kdtree/ray_batch-inl.h"
 #include "kdtree/traced_ray-inl.h"
@@ -81,6 +82,7 @@ class Packet {
 
     /// Traces the rays that have been set up.
     HWY_NOINLINE void trace() {
+        mailboxes_.next_packet();
         size_t stacked = 0;
         for (size_t pushed = stacked_;;) {
             for (const size_t end = stacked + pushed; stacked != end; ++stacked) {
@@ -554,13 +556,19 @@ class Packet {
         View view;
         uint32_t reached = view.look(focus_, BlockLoader(blocks_ + index, second), entry_, reach_);
         reached &= (1U << (kBlockSize * (1 + second))) - 1;
-        // First which of them rays meet, without a branch for each: those are hard to foresee.
+        // First which of them are new, and which of those rays meet, without a branch for each: those are hard to
+        // foresee.
         uint32_t met[View::kSize];
         uint32_t meeting[View::kSize];
-        size_t count = 0;
+        size_t new_count = 0;
         for (; reached != 0; reached &= reached - 1) {
-            met[count] = static_cast<uint32_t>(std::countr_zero(reached));
-            meeting[count] = rays_meeting(view, met[count]);
+            met[new_count] = static_cast<uint32_t>(std::countr_zero(reached));
+            new_count += mailboxes_.is_new(triangle_at(blocks_, index * kBlockSize + met[new_count]));
+        }
+        size_t count = 0;
+        for (size_t i = 0; i < new_count; ++i) {
+            met[count] = met[i];
+            meeting[count] = rays_meeting(view, met[i]);
             count += meeting[count] != 0 ? 1 : 0;
         }
         bool taken = false;
@@ -726,6 +734,7 @@ class Packet {
     alignas(64) float sure_before_[kRays];  ///< a hit wholly before this is nearer than any so far, and than t_max
     alignas(64) float box_start_[kRays], box_reach_[kRays];
     alignas(64) uint32_t place_[kRays], triangle_[kRays];
+    Mailboxes mailboxes_;
     uint32_t places_[kCapacity];  ///< what is to be visited: node * kWidth + slot of its child
     float depths_[kCapacity];
 };

@@ -6,6 +6,7 @@
 #include <numeric>
 #include <random>
 
+#include "kdtree/mailboxes.h"
 #include "kdtree/plain_traversal.h"
 #include "kdtree/traversal.h"
 #include "meshes.h"
@@ -58,6 +59,22 @@ Tree make_flat_list(const Mesh& mesh, uint32_t longest_leaf = WideNode::kMaxLeaf
         std::fill(node.order, node.order + 8, 076543210U);
     }
     return tree;
+}
+
+TEST(Mailboxes, KnowATriangleUntilTheNextPacket) {
+    Mailboxes mailboxes;
+    Mailboxes unused;
+    for (uint32_t packet = 0; packet < 50; ++packet) {  // more than marks can tell apart
+        mailboxes.next_packet();
+        // Some of this packet and of the sixteenth before it, and two that share a place.
+        for (const uint32_t triangle : {1000 + packet % 16, 511U, kMaxTriangles - 1}) {
+            EXPECT_EQ(mailboxes.is_new(triangle), 1U) << triangle << " in packet " << packet;
+            EXPECT_EQ(mailboxes.is_new(triangle), 0U) << triangle << " in packet " << packet;
+        }
+        EXPECT_EQ(mailboxes.is_new(511), 1U) << "the last one took its place";
+        unused.next_packet();
+        EXPECT_EQ(Mailboxes(unused).is_new(kMaxTriangles - 1), 1U) << "of packet " << packet;
+    }
 }
 
 /// Whatever the tree, a ray hits what it would hit if every triangle were tested, bit for bit.
