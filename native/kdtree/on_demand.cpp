@@ -34,7 +34,7 @@ OnDemand::OnDemand(const TriangleSoup& soup, const BuildParameters& parameters, 
       whole_(std::max(kWhole, parameters.one_thread)),
       memory_(size_t{2} * soup.size() + kWhole, 0, SIZE_MAX),
       most_parts_(most_parts(soup.size())),
-      parts_(new Part[most_parts_]),
+      parts_(most_parts_ / PartChunk::kSize + 1),
       most_blocks_(most_blocks(soup.size())) {}
 
 void OnDemand::make_references(Tree& tree) {
@@ -62,13 +62,14 @@ void OnDemand::split_top(Tree& tree) {
         const uint32_t count = part_count_.load() - first;
         parallel_for(threads_, count, [&](size_t i) {
             const auto number = first + static_cast<uint32_t>(i);
-            if (parts_[number].node.count > cut) {
+            if (part(number).node.count > cut) {
                 open(WideNode::unopened(number));
             }
         });
         first += count;
     }
     opened_before_ = opened_.load();
+    scratch_.clear();  // larger than any subtree that rays open will need
 }
 
 /// The wide node for a top node and those below it.
@@ -119,22 +120,24 @@ uint32_t OnDemand::new_part(const OpenNode& node, const TopNode* top, const Refe
     if (number >= most_parts_) {
         throw std::length_error("the tree has more subtrees to open than it can count");
     }
-    Part& part = parts_[number];
-    part.node = node;
-    part.top = top;
-    part.references = references;
+    PartChunk& chunk = parts_[number / PartChunk::kSize];
+    std::call_once(chunk.is_made, [&] { chunk.parts = std::make_unique<Part[]>(PartChunk::kSize); });
+    Part& made = part(number);
+    made.node = node;
+    made.top = top;
+    made.references = references;
     return WideNode::unopened(number);
 }
 
 uint32_t OnDemand::open(uint32_t child) {
-    Part& part = parts_[WideNode::number(child)];
-    uint32_t code = part.code.load(std::memory_order_acquire);
+    Part& wanted = part(WideNode::number(child));
+    uint32_t code = wanted.code.load(std::memory_order_acquire);
     if (code == 0) {
-        const std::lock_guard lock(part.mutex);
-        code = part.code.load(std::memory_order_relaxed);
+        const std::lock_guard lock(wanted.mutex);
+        code = wanted.code.load(std::memory_order_relaxed);
         if (code == 0) {
-            code = build(part);
-            part.code.store(code, std::memory_order_release);
+            code = build(wanted);
+            wanted.code.store(code, std::memory_order_release);
             opened_.fetch_add(1, std::memory_order_relaxed);
         }
     }

@@ -45,6 +45,12 @@ class OnDemand {
         const TopNode* top;  ///< whose segments hold the references; null if they lie here:
         References references;
     };
+    /// Made when the first of them is needed: most scenes have far fewer than they might.
+    struct PartChunk {
+        static constexpr uint32_t kSize = 512;
+        std::once_flag is_made;
+        std::unique_ptr<Part[]> parts;
+    };
     /// What building a subtree takes, used again and again.
     struct Scratch {
         ReferenceBuffer room;
@@ -53,6 +59,7 @@ class OnDemand {
     };
     static constexpr size_t kWholeOutput = 16384;
 
+    Part& part(uint32_t number) { return parts_[number / PartChunk::kSize].parts[number % PartChunk::kSize]; }
     uint32_t lay_out(uint32_t top_node);
     uint32_t new_part(const OpenNode& node, const TopNode* top, const References& references);
     uint32_t build(Part& part);
@@ -70,7 +77,7 @@ class OnDemand {
 
     SegmentMemory memory_;  ///< of the references of subtrees that wait, but for the top's
     const uint32_t most_parts_;
-    std::unique_ptr<Part[]> parts_;
+    std::vector<PartChunk> parts_;
     std::atomic<uint32_t> part_count_{0};
     std::atomic<uint32_t> opened_{0};
     uint32_t opened_before_ = 0;  ///< rays started

@@ -22,7 +22,7 @@ uint32_t with_slack(uint32_t count) { return count + count / 4 + 2 * kMargin; }
 
 /// References that the top usually makes, or for what is done behind it.
 size_t places_for(uint32_t triangles, LaterUse later_use) {
-    return triangles + (later_use == LaterUse::kNone ? size_t{triangles} / 4 : size_t{3} * triangles / 2);
+    return triangles + (later_use == LaterUse::kNone ? size_t{triangles} / 8 : size_t{3} * triangles / 2);
 }
 
 void add(const BinCounts& part, BinCounts& sum) {
