@@ -79,8 +79,8 @@ class Builder {
                 subtrees.add_sorted(*top);
             } else {
                 // From then on one node for each thread will do: what one thread splits depth first stays in its cache.
-                // A quarter more than its share does as well, since straddlers count on both sides.
-                top->split_above(soup_.size() / static_cast<uint32_t>(threads_) / 4 * 5);
+                // A tenth more than its share does as well, since straddlers count on both sides.
+                top->split_above(soup_.size() / static_cast<uint32_t>(threads_) * 11 / 10);
                 subtrees.add_below(*top);
             }
             phases.top_levels = watch.lap();

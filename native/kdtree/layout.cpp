@@ -47,7 +47,8 @@ std::vector<BlockTask> cut_to_tasks(std::span<const TreePiece> pieces) {
     return tasks;
 }
 
-/// All threads together: the first node of each run lies on another page, and one thread writes them all.
+/// All threads together: the nodes above all runs lie far apart, most on a page of their own, and one thread writes
+/// them. What follows the last whole page is left to those who write there.
 void take_huge_pages(LargeBuffer<WideNode>& nodes, int threads) {
     constexpr size_t kPage = LargeBuffer<WideNode>::kHugePage / sizeof(WideNode);
     parallel_for(threads, nodes.size() / kPage, [&](size_t i) { nodes.take_pages(i * kPage, (i + 1) * kPage); });

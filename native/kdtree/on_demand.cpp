@@ -70,6 +70,7 @@ void OnDemand::split_top(Tree& tree) {
     }
     opened_before_ = opened_.load();
     scratch_.clear();  // larger than any subtree that rays open will need
+    scratch_count_ = 0;
 }
 
 /// The wide node for a top node and those below it.
@@ -166,6 +167,7 @@ uint32_t OnDemand::build(Part& part) {
 std::unique_ptr<OnDemand::Scratch> OnDemand::take_scratch() {
     const std::lock_guard lock(scratch_mutex_);
     if (scratch_.empty()) {
+        scratch_.reserve(++scratch_count_);  // giving it back must not fail
         return std::make_unique<Scratch>();
     }
     std::unique_ptr<Scratch> taken = std::move(scratch_.back());
@@ -173,8 +175,8 @@ std::unique_ptr<OnDemand::Scratch> OnDemand::take_scratch() {
     return taken;
 }
 
-/// Splits a node into the children of one wide node, which wait to be opened. Left children stay where their parent's
-/// references lie in the scratch room, right ones go behind all others.
+/// Splits a node into the children of one wide node, which wait to be opened. In the scratch room, left children stay
+/// where their parent's references lie, and right ones go behind all others.
 uint32_t OnDemand::divide(const Part& part, Scratch& scratch) {
     const OpenNode& node = part.node;
     struct Item {
@@ -229,16 +231,24 @@ uint32_t OnDemand::divide(const Part& part, Scratch& scratch) {
     const uint32_t index = add_nodes(1);
     WideNode& wide = nodes_[index];
     order.write(count, wide);
-    // Children lie where their parent lay as far as there is room: memory that was in use is in the cache, and cleared.
-    uint32_t free = part.top == nullptr ? node.count : 0;
+    // Children lie where their parent lay as far as there is room, whose pages are taken already. Nothing there is
+    // touched before all that may fail is done: who asks again finds the parent as it was.
+    const uint32_t room = part.top == nullptr ? node.count : 0;
+    uint32_t used = 0;
+    std::array<References, WideNode::kWidth> places;
     for (size_t i = 0; i < count; ++i) {
         const uint32_t references = items[i].node.count;
-        const bool fits = references <= free;
-        const References place = fits ? part.references.at(node.count - free) : memory_.take(references);
-        free -= fits ? references : 0;
-        copy_references(at(items[i].begin), references, place);
+        if (used + references <= room) {
+            places[i] = part.references.at(used);
+            used += references;
+        } else {
+            places[i] = memory_.take(references);
+        }
         set_box(wide, i, items[i].node.tight);
-        wide.child[i] = new_part(items[i].node, nullptr, place);
+        wide.child[i] = new_part(items[i].node, nullptr, places[i]);
+    }
+    for (size_t i = 0; i < count; ++i) {
+        copy_references(at(items[i].begin), items[i].node.count, places[i]);
     }
     return index;
 }

@@ -91,6 +91,7 @@ class OnDemand {
 
     std::mutex scratch_mutex_;
     std::vector<std::unique_ptr<Scratch>> scratch_;  ///< that nobody uses now
+    size_t scratch_count_ = 0;                       ///< of all, those in use among them
 };
 
 }  // namespace espalier

@@ -667,8 +667,8 @@ class Packet {
         const uint32_t triangle = triangle_at(blocks_, place);
         const V reach = hn::Load(d, reaches_ + lane);
         const V sure_before = hn::Load(d, sure_before_ + lane);
-        const auto is_new = hn::Ne(hn::Load(du, triangle_ + lane), hn::Set(du, triangle));
-        const auto counts = hn::And(hn::And(inside, hn::RebindMask(d, is_new)),
+        const auto is_other = hn::Ne(hn::Load(du, triangle_ + lane), hn::Set(du, triangle));
+        const auto counts = hn::And(hn::And(inside, hn::RebindMask(d, is_other)),
                                     hn::And(hn::Le(lower, reach), hn::Ge(upper, hn::Load(d, start_ + lane))));
         const auto sure = hn::And(hn::And(counts, certain),
                                   hn::And(hn::Ge(lower, hn::Load(d, sure_start_ + lane)), hn::Lt(upper, sure_before)));

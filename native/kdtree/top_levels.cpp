@@ -20,7 +20,7 @@ uint32_t choose_segment_size(uint32_t triangles, int threads) {
 constexpr uint32_t kMargin = 16;
 uint32_t with_slack(uint32_t count) { return count + count / 4 + 2 * kMargin; }
 
-/// References that the top usually makes, or for what is done behind it.
+/// Places for the references that the top usually makes, and for those of subtrees if they follow in the same memory.
 size_t places_for(uint32_t triangles, LaterUse later_use) {
     return triangles + (later_use == LaterUse::kNone ? size_t{triangles} / 8 : size_t{3} * triangles / 2);
 }

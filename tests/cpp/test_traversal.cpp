@@ -66,8 +66,8 @@ TEST(Mailboxes, KnowATriangleUntilTheNextPacket) {
     Mailboxes unused;
     for (uint32_t packet = 0; packet < 50; ++packet) {  // more than marks can tell apart
         mailboxes.next_packet();
-        // Some of this packet and of the sixteenth before it, and two that share a place.
-        for (const uint32_t triangle : {1000 + packet % 16, 511U, kMaxTriangles - 1}) {
+        // Some of the packet and of the fifteenth and the sixteenth before it, and two that share a place.
+        for (const uint32_t triangle : {1000 + packet % 15, 2000 + packet % 16, 511U, kMaxTriangles - 1}) {
             EXPECT_EQ(mailboxes.is_new(triangle), 1U) << triangle << " in packet " << packet;
             EXPECT_EQ(mailboxes.is_new(triangle), 0U) << triangle << " in packet " << packet;
         }
