@@ -49,6 +49,9 @@ BuildParameters parameters_of(Quality quality) {
 /// What a triangle usually adds to subtrees until they are in their places, and to the plans of their nodes.
 constexpr size_t kTransientBytes = 19;
 
+/// Up to so many triangles the top's segments and what their partition takes are a good 1.4 references each.
+constexpr uint32_t kRoomy = 1U << 17;
+
 /// The phases of a build, in order.
 class Builder {
  public:
@@ -79,8 +82,10 @@ class Builder {
                 subtrees.add_sorted(*top);
             } else {
                 // From then on one node for each thread will do: what one thread splits depth first stays in its cache.
-                // A tenth more than its share does as well, since straddlers count on both sides.
-                top->split_above(soup_.size() / static_cast<uint32_t>(threads_) * 11 / 10);
+                // Somewhat more than its share does as well, since straddlers count on both sides: a quarter, or what
+                // large scenes have room for behind the top's references.
+                const uint32_t share = soup_.size() / static_cast<uint32_t>(threads_);
+                top->split_above(share + share / (soup_.size() <= kRoomy ? 4 : 10));
                 subtrees.add_below(*top);
             }
             phases.top_levels = watch.lap();
