@@ -105,6 +105,10 @@ class LargeBuffer {
 
     /// Takes the pages of items [begin, end) now (see above).
     void take_pages(size_t begin, size_t end) { espalier::take_pages(data_ + begin, data_ + std::min(end, capacity_)); }
+    void take_huge_page(size_t page) {
+        constexpr size_t kItems = kHugePage / sizeof(T);
+        take_pages(page * kItems, (page + 1) * kItems);
+    }
 
     T* data() { return data_; }
     const T* data() const { return data_; }
@@ -155,10 +159,7 @@ class TransientMemory {
 
     /// It has so many huge pages, which are taken when they are first written to, or now.
     size_t huge_pages() const { return huge_pages_; }
-    void take_huge_page(size_t page) {
-        constexpr size_t kPage = LargeBuffer<std::byte>::kHugePage;
-        memory_.take_pages(page * kPage, (page + 1) * kPage);
-    }
+    void take_huge_page(size_t page) { memory_.take_huge_page(page); }
 
  private:
     static constexpr size_t kLeastBytes = size_t{64} << 20;  ///< of addresses, not of memory

@@ -50,8 +50,7 @@ std::vector<BlockTask> cut_to_tasks(std::span<const TreePiece> pieces) {
 /// All threads together: the nodes above all runs lie far apart, most on a page of their own, and one thread writes
 /// them. What follows the last whole page is left to those who write there.
 void take_huge_pages(LargeBuffer<WideNode>& nodes, int threads) {
-    constexpr size_t kPage = LargeBuffer<WideNode>::kHugePage / sizeof(WideNode);
-    parallel_for(threads, nodes.size() / kPage, [&](size_t i) { nodes.take_pages(i * kPage, (i + 1) * kPage); });
+    parallel_for(threads, nodes.bytes() / LargeBuffer<WideNode>::kHugePage, [&](size_t i) { nodes.take_huge_page(i); });
 }
 
 }  // namespace

@@ -517,15 +517,9 @@ class Packet {
     HWY_INLINE void prefetch(uint32_t place) const {
         const uint32_t child = nodes_[place / WideNode::kWidth].child[place % WideNode::kWidth];
         if ((child & WideNode::kLeafFlag) != 0) {
-            const auto* blocks = reinterpret_cast<const char*>(blocks_ + WideNode::first_block(child));
-            for (size_t byte = 0; byte < 2 * sizeof(TriangleBlock); byte += 64) {
-                __builtin_prefetch(blocks + byte);
-            }
+            prefetch_lines<2 * sizeof(TriangleBlock) / 64>(blocks_ + WideNode::first_block(child));
         } else {
-            const auto* node = reinterpret_cast<const char*>(nodes_ + child);
-            for (size_t byte = 0; byte < sizeof(WideNode); byte += 64) {
-                __builtin_prefetch(node + byte);
-            }
+            prefetch_lines<sizeof(WideNode) / 64>(nodes_ + child);
         }
     }
 

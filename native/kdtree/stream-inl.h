@@ -241,8 +241,8 @@ class Stream {
     static constexpr size_t kCached = size_t{10} << 20;
     /// Lines of 64 bytes that are fetched of a node, and of a leaf from where a ray goes on, of whose blocks each has
     /// five.
-    static constexpr int kLinesOfNode = sizeof(WideNode) / 64;
-    static constexpr int kLinesOfLeaf = kBlocksPerStep == 2 ? 8 : 5;
+    static constexpr size_t kLinesOfNode = sizeof(WideNode) / 64;
+    static constexpr size_t kLinesOfLeaf = kBlocksPerStep == 2 ? 8 : 5;
 
     /// How many rays are on each list. Not beside the lists: what is written to those and to rays might be these, for
     /// all a compiler knows, and they would be read back at every step.
@@ -353,14 +353,9 @@ class Stream {
         // A choice that compilers would make with a branch.
         const auto* wanted = reinterpret_cast<const char*>(  // NOLINT(performance-no-int-to-ptr)
             node ^ ((node ^ block) & (uintptr_t{0} - is_leaf)));
-        for (int line = 0; line < kLinesOfNode; ++line) {
-            __builtin_prefetch(wanted + 64 * line);
-        }
+        prefetch_lines<kLinesOfNode>(wanted);
         // More of a leaf; the same lines of a node, which costs next to nothing.
-        const char* more = wanted + 64 * kLinesOfNode * is_leaf;
-        for (int line = 0; line < kLinesOfLeaf - kLinesOfNode; ++line) {
-            __builtin_prefetch(more + 64 * line);
-        }
+        prefetch_lines<kLinesOfLeaf - kLinesOfNode>(wanted + 64 * kLinesOfNode * is_leaf);
     }
 
     /// Takes in what a step at a leaf has found. Returns whether there is a new nearest hit.

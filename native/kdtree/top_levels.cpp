@@ -20,9 +20,14 @@ uint32_t choose_segment_size(uint32_t triangles, int threads) {
 constexpr uint32_t kMargin = 16;
 uint32_t with_slack(uint32_t count) { return count + count / 4 + 2 * kMargin; }
 
-/// Places for the references that the top usually makes, and for those of subtrees if they follow in the same memory.
-size_t places_for(uint32_t triangles, LaterUse later_use) {
-    return triangles + (later_use == LaterUse::kNone ? size_t{triangles} / 8 : size_t{3} * triangles / 2);
+/// For the references that the top usually makes, and what all threads take to partition them; and for those of
+/// subtrees and for blocks, if they follow in the same memory.
+SegmentMemory memory_for(uint32_t triangles, uint32_t segment_size, int threads, LaterUse later_use) {
+    const size_t places = triangles + size_t{2} * with_slack(segment_size) * static_cast<size_t>(threads + 1);
+    if (later_use == LaterUse::kNone) {
+        return SegmentMemory(places + triangles / 8);
+    }
+    return SegmentMemory(places + size_t{3} * triangles / 2, most_block_bytes(triangles), usual_block_bytes(triangles));
 }
 
 void add(const BinCounts& part, BinCounts& sum) {
@@ -56,10 +61,7 @@ TopLevels::TopLevels(const TriangleSoup& soup, const BuildParameters& parameters
       is_large_(is_large(soup, parameters)),
       segment_size_(choose_segment_size(soup.size(), threads)),
       later_bytes_(later_use == LaterUse::kNone ? 0 : usual_block_bytes(soup.size())),
-      memory_(
-          places_for(soup.size(), later_use) + size_t{2} * with_slack(segment_size_) * static_cast<size_t>(threads + 1),
-          later_use == LaterUse::kNone ? 0 : most_block_bytes(soup.size()),
-          later_use == LaterUse::kNone ? SIZE_MAX : later_bytes_),
+      memory_(memory_for(soup.size(), segment_size_, threads, later_use)),
       scratch_(static_cast<size_t>(threads)) {}
 
 void TopLevels::make_references(TransientMemory* transient) {

@@ -19,7 +19,7 @@ struct Segment {
 /// Memory for segments, handed out to any thread.
 class SegmentMemory {
  public:
-    SegmentMemory(size_t capacity, size_t later_bytes, size_t usual_bytes) {
+    explicit SegmentMemory(size_t capacity, size_t later_bytes = 0, size_t usual_bytes = SIZE_MAX) {
         buffers_.emplace_back(capacity, later_bytes, usual_bytes);
     }
     References take(uint32_t count);
@@ -108,7 +108,7 @@ class TopLevels {
     const BuildKernels& kernels_;
     const bool is_large_;  ///< whether the root is split several levels at once, if it can be
     const uint32_t segment_size_;
-    const size_t later_bytes_;  ///< that are usually in use later
+    const size_t later_bytes_;  ///< that are usually in use later; 0 if none
     SegmentMemory memory_;
     SortedNode root_;  ///< of one leaf, if the scene is not sorted
     std::vector<TopNode> nodes_;

@@ -38,6 +38,15 @@ HWY_INLINE hn::Mask<D> mask_of(D d, uint32_t bits) {
     return hn::LoadMaskBits(d, reinterpret_cast<const uint8_t*>(&room));
 }
 
+/// Has so many lines of 64 bytes fetched. A number known when compiling: a loop that is not unrolled costs more than it
+/// gains.
+template <size_t kLines>
+HWY_INLINE void prefetch_lines(const void* from) {
+    for (size_t line = 0; line < kLines; ++line) {
+        __builtin_prefetch(static_cast<const char*>(from) + 64 * line);
+    }
+}
+
 /// The larger of the sizes of two numbers.
 template <class V>
 HWY_INLINE V largest_of(V a, V b) {
