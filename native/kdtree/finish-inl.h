@@ -14,7 +14,6 @@
 #include <bit>
 #include <cstddef>
 #include <cstdint>
-#include <limits>
 #include <span>
 #include <type_traits>
 
@@ -90,42 +89,47 @@ struct HitEquations {
     }
 };
 
+/// Where rays hit, by the equations of what they hit; size: of the largest components of their directions.
+template <class VF>
+struct Solution {
+    VF t;
+    VF u;
+    VF v;
+    uint32_t open = 0;  ///< lanes for which double does not suffice
+
+    template <class V>
+    HWY_INLINE Solution(const V (&direction)[3], V size, const HitEquations<V>& equations) {
+        const hn::DFromV<V> d;
+        const V det = dot(direction, equations.normal);
+        const V scale = hn::Div(hn::Set(d, 1), det);
+        // Beyond the largest float, t becomes infinite. A zero has no sign: that of the origin's zeros would show in
+        // it, and rays of a packet may differ in those.
+        t = narrowed(hn::Add(hn::Mul(equations.volume, scale), hn::Zero(d)));
+        u = narrowed(hn::Max(hn::Mul(dot(direction, equations.u_normal), scale), hn::Zero(d)));
+        v = narrowed(hn::Max(hn::Mul(dot(direction, equations.v_normal), scale), hn::Zero(d)));
+        if constexpr (std::is_same_v<hn::TFromV<V>, double>) {
+            const auto is_sure = hn::Ge(hn::Abs(det), hn::Mul(equations.least_det, size));
+            open = static_cast<uint32_t>(mask_bits(d, hn::Not(is_sure)));
+        }
+    }
+
+ private:
+    template <class V>
+    static HWY_INLINE VF narrowed(V value) {
+        if constexpr (std::is_same_v<hn::TFromV<V>, double>) {
+            return hn::DemoteTo(hn::DFromV<VF>(), value);
+        } else {
+            return value;
+        }
+    }
+};
+
 /// Hits in columns.
 template <size_t kSize>
 struct HitColumns {
     alignas(64) float t[kSize];
     alignas(64) float u[kSize];
     alignas(64) float v[kSize];
-
-    /// Fills in the lanes from `first` on that the mask selects. Returns those of them for which double does not
-    /// suffice.
-    template <class V, class DF>
-    HWY_INLINE uint32_t put(DF df, size_t first, hn::Mask<DF> lanes, const V (&direction)[3],
-                            const HitEquations<V>& equations) {
-        const hn::DFromV<V> d;
-        const V det = dot(direction, equations.normal);
-        const V scale = hn::Div(hn::Set(d, 1), det);
-        const V distance = hn::Mul(equations.volume, scale);
-        const auto store = [&](V value, float* to) {
-            if constexpr (std::is_same_v<hn::TFromV<V>, double>) {
-                hn::BlendedStore(hn::DemoteTo(df, value), lanes, df, to + first);
-            } else {
-                hn::BlendedStore(value, lanes, df, to + first);
-            }
-        };
-        // A zero has no sign: that of the origin's zeros would show in it, and rays of a packet may differ in those.
-        store(hn::Add(distance, hn::Zero(d)), t);
-        store(hn::Max(hn::Mul(dot(direction, equations.u_normal), scale), hn::Zero(d)), u);
-        store(hn::Max(hn::Mul(dot(direction, equations.v_normal), scale), hn::Zero(d)), v);
-        if constexpr (std::is_same_v<hn::TFromV<V>, double>) {
-            const auto is_sure =
-                hn::And(hn::Ge(hn::Abs(det), hn::Mul(equations.least_det, largest_of(direction))),
-                        hn::Le(hn::Abs(distance), hn::Set(d, double{std::numeric_limits<float>::max()})));
-            return mask_bits(df, lanes) & ~mask_bits(d, is_sure);
-        } else {
-            return 0;
-        }
-    }
 
     /// Of the triangles with these numbers, kNoTriangle where there is none.
     HWY_INLINE void write(const uint32_t* triangles, Hit* hits) const {
@@ -185,7 +189,11 @@ struct alignas(64) FinishBatch : HitColumns<16> {
                     triangle[k][axis] = widened(d, hn::Load(df, corner[k][axis] + first));
                 }
             }
-            open |= this->put(df, first, hn::FirstN(df, kLanes), along, HitEquations<V>(from, triangle)) << first;
+            const Solution<hn::Vec<decltype(df)>> found(along, largest_of(along), HitEquations<V>(from, triangle));
+            hn::Store(found.t, df, t + first);
+            hn::Store(found.u, df, u + first);
+            hn::Store(found.v, df, v + first);
+            open |= found.open << first;
         }
         return open;
     }
@@ -270,6 +278,7 @@ class FinishQueue {
         std::fill_n(columns.v, kRays, 0.0F);
         const Vec3f focus = rays_[first].origin;
         const V origin[3] = {hn::Set(d, Number{focus.x}), hn::Set(d, Number{focus.y}), hn::Set(d, Number{focus.z})};
+        const size_t main_axis = packet.main_axis();
         uint32_t open = 0;
         for (size_t i = 0; i < places.size(); ++i) {
             const float* from = corners_at(blocks_, places[i]);
@@ -287,7 +296,20 @@ class FinishQueue {
                     for (size_t axis = 0; axis < 3; ++axis) {
                         direction[axis] = widened(d, hn::Load(df, packet.direction(axis) + lane));
                     }
-                    open |= columns.put(df, lane, mask_of(df, here), direction, equations) << lane;
+                    const Solution<hn::Vec<decltype(df)>> found(direction, hn::Abs(direction[main_axis]), equations);
+                    const auto hit = mask_of(df, here);
+                    const auto put = [&](hn::Vec<decltype(df)> value, float* to) {
+#if HWY_TARGET == HWY_AVX3_DL
+                        hn::BlendedStore(value, hit, df, to);
+#else
+                        // A masked store takes some processors twenty operations.
+                        hn::Store(hn::IfThenElse(hit, value, hn::Load(df, to)), df, to);
+#endif
+                    };
+                    put(found.t, columns.t + lane);
+                    put(found.u, columns.u + lane);
+                    put(found.v, columns.v + lane);
+                    open |= (found.open & here) << lane;
                 }
             }
         }

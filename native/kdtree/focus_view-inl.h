@@ -103,12 +103,14 @@ struct FocusView {
             V bound_here = hn::Zero(d);
             V margin = hn::Zero(d);
             if constexpr (kExact) {
-                const V m = hn::Add(largest_of(x), largest_of(y));
-                const V edge = hn::Add(hn::Add(largest_of(edge_x), largest_of(edge_y)),
-                                       hn::Add(largest_of(edge_z), hn::Set(d, kTiny)));
+                // Of the two edges at the first corner: the third is no longer than both together, and no corner lies
+                // farther from the first.
+                const V across = hn::Add(largest_of(edge_x[1], edge_x[2]), largest_of(edge_y[1], edge_y[2]));
+                const V edge = hn::Add(across, hn::Add(largest_of(edge_z[1], edge_z[2]), hn::Set(d, kTiny)));
+                const V m = hn::Add(across, hn::Add(hn::Abs(x[0]), hn::Abs(y[0])));
                 margin = hn::MulAdd(hn::Set(d, focus.along_error), mz,
                                     hn::MulAdd(hn::Set(d, 14 * 0x1p-24F), m, hn::Set(d, focus.miss)));
-                bound_here = hn::MulAdd(edge, margin, hn::Set(d, kTiny));
+                bound_here = hn::MulAdd(hn::Add(edge, edge), margin, hn::Set(d, kTiny));
             }
             V most_inside = hn::Zero(d);
             V least_inside = hn::Zero(d);

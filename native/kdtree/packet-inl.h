@@ -125,6 +125,8 @@ class Packet {
     }
     const uint32_t* triangles() const { return triangle_; }
     const float* direction(size_t axis) const { return direction_[axis]; }
+    /// Of the directions' largest components, once a ray has met something.
+    size_t main_axis() const { return focus_.z / kBlockSize; }
     const float* t_max() const { return t_max_; }
 
  private:

@@ -563,6 +563,29 @@ TEST(Traversal, HitsTrianglesOfEverySize) {
     }
 }
 
+/// Alone, as a packet, and as many that make none.
+TEST(Traversal, HitsBeyondTheLargestFloatAreInfinitelyFar) {
+    Mesh mesh;
+    mesh.add_triangle({-0x1p58F, -0x1p58F, 0x1p58F}, {0x1p58F, -0x1p58F, 0x1p58F}, {0, 0x1p58F, 0x1p58F});
+    const Tree tree = build(mesh.soup(), {});
+    for (const size_t count : {size_t{1}, size_t{32}, size_t{64}}) {
+        std::vector<Ray> rays(count, {{0, 0, 0}, 0, {0, 0, 0x1p-90F}, INFINITY});
+        if (count == 64) {
+            for (size_t i = 0; i < count; ++i) {
+                rays[i].origin.x = static_cast<float>(i);
+            }
+        }
+        std::vector<Hit> hits(count);
+        intersect(tree, rays, hits);
+        for (const Hit& hit : hits) {
+            EXPECT_EQ(hit.triangle, 0) << count;
+            EXPECT_EQ(hit.t, INFINITY) << count;
+            EXPECT_FLOAT_EQ(hit.u, 0.25F) << count;
+            EXPECT_FLOAT_EQ(hit.v, 0.5F) << count;
+        }
+    }
+}
+
 TEST(Traversal, BarycentricsNameTheCorners) {
     Mesh mesh;
     mesh.add_triangle({0, 0, 0}, {4, 0, 0}, {0, 4, 0});
