@@ -367,6 +367,60 @@ def test_rays_are_refused(
             method(origins, directions, **limits)
 
 
+UNSOUND = [
+    *((part, axis, value) for part in ("origins", "directions") for axis in range(3) for value in (np.nan, np.inf)),
+    *(("origins", axis, -(2.0**61)) for axis in range(3)),
+    *(("directions", axis, 2.0**101) for axis in range(3)),
+    ("directions", slice(None), 2.0**-101),
+    ("t_min", None, np.nan),
+    ("t_min", None, np.inf),
+    ("t_min", None, -1.0),
+    ("t_max", None, np.nan),
+    ("t_max", None, 0.5),
+]
+
+
+@pytest.mark.parametrize("at", [0, 3, 6])
+@pytest.mark.parametrize(("part", "axis", "value"), UNSOUND)
+def test_one_unsound_number_among_sound_rays_is_found(part: str, axis: Any, value: float, at: int) -> None:
+    tree = espalier_native.build(*ONE_TRIANGLE)
+    arrays = {
+        "origins": np.zeros((7, 3), np.float32),
+        "directions": np.ones((7, 3), np.float32),
+        "t_min": np.ones(7, np.float32),
+        "t_max": np.full(7, 2, np.float32),
+    }
+    arrays[part][(at,) if axis is None else (at, axis)] = value
+    with pytest.raises(ValueError, match=f"ray {at}: {'t_m' if axis is None else part}"):
+        tree.intersect(**arrays)
+
+
+@pytest.mark.parametrize(
+    ("part", "value", "triangle"),
+    [
+        ("origins", (2.0**60, -(2.0**60), 2.0**60), -1),
+        ("directions", (0, 0, -(2.0**-100)), 0),
+        ("directions", (0, -(2.0**-100), 0), -1),
+        ("directions", (2.0**-100, 0, 0), -1),
+        ("directions", (2.0**100, -(2.0**100), 2.0**100), -1),
+        ("t_min", -0.0, 0),
+        ("t_min", np.finfo(np.float32).max, -1),
+        ("t_max", 0.0, -1),
+        ("t_max", np.inf, 0),
+    ],
+)
+def test_extreme_rays_are_traced(part: str, value: Any, triangle: int) -> None:
+    tree = espalier_native.build(*ONE_TRIANGLE)
+    arrays = {
+        "origins": np.tile(DOWN[0], (7, 1)),
+        "directions": np.tile(DOWN[1], (7, 1)),
+        "t_min": np.zeros(7, np.float32),
+        "t_max": np.full(7, np.inf, np.float32),
+    }
+    arrays[part][:] = value
+    assert tree.intersect(**arrays)["triangle"].tolist() == [triangle] * 7
+
+
 def test_first_unsound_ray_is_named_whatever_thread_meets_it() -> None:
     tree = espalier_native.build(*ONE_TRIANGLE)
     origins, directions = np.zeros((50_000, 3), np.float32), np.ones((50_000, 3), np.float32)

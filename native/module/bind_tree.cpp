@@ -10,11 +10,14 @@
 #include "geometry/float_environment.h"
 #include "geometry/triangle.h"
 #include "kdtree/parallel.h"
+#include "kdtree/simd_config.h"
 #include "kdtree/traversal.h"
 #include "module/arrays.h"
 #include "module/bindings.h"
 #include "module/docs.h"
 #include "module/reports.h"
+// Highway's own header has to follow simd_config.h.
+#include <hwy/highway.h>
 
 namespace py = pybind11;
 using namespace py::literals;
@@ -22,7 +25,12 @@ using namespace py::literals;
 namespace espalier {
 namespace {
 
+namespace hn = hwy::HWY_NAMESPACE;
+
 constexpr size_t kRaysPerTask = 4096;
+/// What the largest component of a direction may be.
+constexpr float kShortest = 0x1p-100F;
+constexpr float kLongest = 0x1p100F;
 
 /// One end of the rays' range: the same for all, or one number per ray.
 struct RangeEnd {
@@ -44,6 +52,40 @@ RangeEnd range_end(py::handle value, const std::string& name, size_t rays) {
     }
     return {static_cast<float>(number), {}};
 }
+
+/// Packs rays, each as two quadruples, and keeps whether all were sound.
+class RayPacker {
+    using D = hn::Full128<float>;
+    using V = hn::Vec<D>;
+
+ public:
+    /// Reads four numbers of each of the two rows.
+    void pack(const float* origin, float t_min, const float* direction, float t_max, Ray& ray) {
+        const V from = hn::InsertLane(hn::LoadU(D(), origin), 3, t_min);
+        const V along = hn::InsertLane(hn::LoadU(D(), direction), 3, t_max);
+        hn::StoreU(from, D(), &ray.origin.x);
+        hn::StoreU(along, D(), &ray.direction.x);
+        const V size = hn::Abs(along);
+        const V largest = hn::Max(size, hn::Max(hn::Shuffle0321(size), hn::Shuffle1032(size)));  // in the first lane
+        // Comparisons with NaN are false.
+        const auto is_near = hn::And(hn::Le(hn::Abs(from), farthest_), hn::Ge(from, least_));
+        const auto is_usual = hn::And(hn::Le(size, longest_), hn::Ge(largest, shortest_));
+        const auto is_range = hn::Ge(hn::IfThenElse(is_end_, along, from), from);
+        sound_ = hn::And(sound_, hn::And(hn::And(is_near, is_usual), is_range));
+    }
+    bool all_sound() const { return hn::AllTrue(D(), sound_); }
+
+ private:
+    static V quad(float xyz, float end) { return hn::InsertLane(hn::Set(D(), xyz), 3, end); }
+
+    static constexpr float kMost = std::numeric_limits<float>::max();
+    const V farthest_ = quad(kMaxCoordinate, kMost);
+    const V least_ = quad(-kMost, 0);
+    const V longest_ = quad(kLongest, std::numeric_limits<float>::infinity());
+    const V shortest_ = hn::InsertLane(hn::Zero(D()), 0, kShortest);
+    const hn::Mask<D> is_end_ = hn::Gt(quad(0, 1), hn::Zero(D()));
+    hn::Mask<D> sound_ = hn::Eq(hn::Zero(D()), hn::Zero(D()));
+};
 
 /// Rays as they came from Python, checked while they are packed.
 class RayInput {
@@ -86,7 +128,8 @@ class RayInput {
                 trace(first, std::span<const Ray>(rays), worker);
                 return;
             }
-            const auto bad = std::find_if_not(rays.begin(), rays.end(), is_sound);
+            const auto bad =
+                std::find_if(rays.begin(), rays.end(), [](const Ray& ray) { return fault(ray) != nullptr; });
             const std::lock_guard lock(mutex);
             if (const size_t number = first + static_cast<size_t>(bad - rays.begin()); number < first_bad) {
                 first_bad = number;
@@ -102,29 +145,23 @@ class RayInput {
     bool pack(size_t first, std::span<Ray> rays) const {
         const float* o = origins_.span().data() + 3 * first;
         const float* d = directions_.span().data() + 3 * first;
-        bool sound = true;
-        for (size_t i = 0; i < rays.size(); ++i, o += 3, d += 3) {
-            rays[i] = {{o[0], o[1], o[2]}, t_min_[first + i], {d[0], d[1], d[2]}, t_max_[first + i]};
-            sound &= is_sound(rays[i]);
+        RayPacker packer;
+        // A row is read with what lies behind it. Behind the last lies nothing.
+        const size_t followed = std::min(rays.size(), size() - 1 - first);
+        for (size_t i = 0; i < followed; ++i, o += 3, d += 3) {
+            packer.pack(o, t_min_[first + i], d, t_max_[first + i], rays[i]);
         }
-        return sound;
+        if (followed < rays.size()) {
+            const float origin[4] = {o[0], o[1], o[2], 0};
+            const float direction[4] = {d[0], d[1], d[2], 0};
+            packer.pack(origin, t_min_[first + followed], direction, t_max_[first + followed], rays.back());
+        }
+        return packer.all_sound();
     }
 
     static float largest_component(Vec3f v) { return std::max({std::abs(v.x), std::abs(v.y), std::abs(v.z)}); }
 
-    /// Whether there is no fault, found without a branch.
-    static bool is_sound(const Ray& ray) {
-        bool sound = ray.t_min >= 0.0F;
-        sound &= ray.t_min <= std::numeric_limits<float>::max();
-        sound &= ray.t_max >= ray.t_min;
-        for (int axis = 0; axis < 3; ++axis) {  // comparisons with NaN are false
-            sound &= std::abs(ray.origin[axis]) <= kMaxCoordinate;
-            sound &= std::abs(ray.direction[axis]) <= kLongest;
-        }
-        return sound & (largest_component(ray.direction) >= kShortest);
-    }
-
-    /// What is wrong with a ray that is not sound.
+    /// What is wrong with a ray; nullptr if it is sound.
     static const char* fault(const Ray& ray) {
         if (!is_finite(ray.origin))
             return "origins is not finite";
@@ -139,11 +176,11 @@ class RayInput {
             return "directions must have its largest component between 2^-100 and 2^100";
         if (!(ray.t_min >= 0.0F) || std::isinf(ray.t_min))
             return "t_min must be finite and not negative";
-        return "t_max must not be less than t_min";
+        if (!(ray.t_max >= ray.t_min))
+            return "t_max must not be less than t_min";
+        return nullptr;
     }
 
-    static constexpr float kShortest = 0x1p-100F;
-    static constexpr float kLongest = 0x1p100F;
     Array<float> origins_, directions_;
     RangeEnd t_min_, t_max_;
     size_t runs_;
@@ -172,10 +209,9 @@ py::dict intersect_rays(const Tree& tree, py::handle origins, py::handle directi
         intersect(tree, rays, hits);
         for (size_t i = 0; i < hits.size(); ++i) {
             const Hit& hit = hits[i];
-            const bool missed = hit.triangle < 0;
-            t_out[first + i] = missed ? std::numeric_limits<float>::infinity() : hit.t;
-            u_out[first + i] = missed ? 0.0F : hit.u;
-            v_out[first + i] = missed ? 0.0F : hit.v;
+            t_out[first + i] = hit.triangle < 0 ? std::numeric_limits<float>::infinity() : hit.t;
+            u_out[first + i] = hit.u;
+            v_out[first + i] = hit.v;
             triangle_out[first + i] = hit.triangle;
         }
     });
