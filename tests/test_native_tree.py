@@ -384,7 +384,7 @@ UNSOUND = [
 @pytest.mark.parametrize(("part", "axis", "value"), UNSOUND)
 def test_one_unsound_number_among_sound_rays_is_found(part: str, axis: Any, value: float, at: int) -> None:
     tree = espalier_native.build(*ONE_TRIANGLE)
-    arrays = {
+    arrays: dict[str, Any] = {
         "origins": np.zeros((7, 3), np.float32),
         "directions": np.ones((7, 3), np.float32),
         "t_min": np.ones(7, np.float32),
@@ -411,7 +411,7 @@ def test_one_unsound_number_among_sound_rays_is_found(part: str, axis: Any, valu
 )
 def test_extreme_rays_are_traced(part: str, value: Any, triangle: int) -> None:
     tree = espalier_native.build(*ONE_TRIANGLE)
-    arrays = {
+    arrays: dict[str, Any] = {
         "origins": np.tile(DOWN[0], (7, 1)),
         "directions": np.tile(DOWN[1], (7, 1)),
         "t_min": np.zeros(7, np.float32),

@@ -124,12 +124,11 @@ class RayInput {
             const std::span<Ray> rays(&packed[static_cast<size_t>(worker) * longest_run()],
                                       std::min(kRaysPerTask, size() - run * kRaysPerTask));
             const size_t first = run * kRaysPerTask;
-            if (pack(first, rays)) {
+            const auto bad = pack(first, rays) ? rays.end() : std::find_if(rays.begin(), rays.end(), fault);
+            if (bad == rays.end()) {
                 trace(first, std::span<const Ray>(rays), worker);
                 return;
             }
-            const auto bad =
-                std::find_if(rays.begin(), rays.end(), [](const Ray& ray) { return fault(ray) != nullptr; });
             const std::lock_guard lock(mutex);
             if (const size_t number = first + static_cast<size_t>(bad - rays.begin()); number < first_bad) {
                 first_bad = number;
