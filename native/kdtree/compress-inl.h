@@ -14,7 +14,7 @@
 
 #include <array>
 #include <cstdint>
-#include <cstring>
+#include <type_traits>
 
 HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
@@ -40,9 +40,11 @@ HWY_INLINE uint64_t mask_bits(D d, hn::Mask<D> mask) {
     }
     (void)d;
 #else
-    uint8_t bytes[8] = {};
-    hn::StoreMaskBits(d, mask, bytes);
-    std::memcpy(&bits, bytes, sizeof bits);
+    // No more bytes than there are: eight, GCC 12 puts together in memory first.
+    constexpr size_t kLanes = hn::MaxLanes(D());
+    std::conditional_t<(kLanes <= 8), uint8_t, std::conditional_t<(kLanes <= 16), uint16_t, uint32_t>> few = 0;
+    hn::StoreMaskBits(d, mask, reinterpret_cast<uint8_t*>(&few));
+    bits = few;
 #endif
     return bits;
 }

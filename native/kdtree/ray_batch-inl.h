@@ -169,7 +169,6 @@ class RayBatch {
             hn::Store(hn::Load(d, quads_[quad] + 4 * lane), d, to + 4 * quad);
         }
         ray.place = kNoPlace;
-        ray.triangle = kNoTriangle;
     }
 
  private:

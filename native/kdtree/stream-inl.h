@@ -181,7 +181,8 @@ class Stream {
             // a processor could look ahead to no more than a few others.
             for (uint32_t i = 0; i < nodes; ++i) {
                 StreamRay& ray = *node_list_[i];
-                go_on(ray, *--ray.top, lists);
+                list(ray, *--ray.top, lists);
+                fetch(ray.next);
             }
             // Whether a ray meets something in a leaf cannot be foreseen: those that may are listed, and looked at
             // together.
@@ -191,7 +192,8 @@ class Stream {
                 StreamRay& ray = kAsksFirst ? *asked_list_[i] : *leaf_list_[i];
                 const uint32_t leaf = ray.next;
                 if (WideNode::is_unopened(leaf)) [[unlikely]] {
-                    go_on(ray, on_demand_->open(leaf), lists);
+                    list(ray, on_demand_->open(leaf), lists);
+                    fetch(ray.next);
                     continue;
                 }
                 const uint32_t further = leaf % WideNode::kMaxLeafBlocks;  // blocks behind the first
@@ -204,6 +206,7 @@ class Stream {
                 const uint32_t meets = at_most_one(possible);
                 meeting += meets;
                 leave(ray, leaf, lists, 1 - meets);
+                fetch(ray.next);
             }
             for (uint32_t i = 0; i < meeting; ++i) {
                 const Meeting& met = meetings_[i];
@@ -217,6 +220,7 @@ class Stream {
                         ray.prune();
                     }
                 }
+                // What it goes on to was fetched behind the test.
                 leave(ray, met.leaf, lists);
             }
             const uint32_t ended = std::exchange(lists.at_end, 0);
@@ -224,7 +228,7 @@ class Stream {
                 StreamRay& ray = *end_list_[i];
                 if (ray.overflow != 0) [[unlikely]] {
                     ray.refill(overflow_[&ray - ray_]);
-                    go_on(ray, *--ray.top, lists);
+                    list(ray, *--ray.top, lists);
                     continue;
                 }
                 done(ray);
@@ -315,7 +319,9 @@ class Stream {
             passing += 1 - meets;
         }
         for (uint32_t i = 0; i < passing; ++i) {
-            leave(*passing_list_[i], passing_list_[i]->next, lists);
+            StreamRay& ray = *passing_list_[i];
+            leave(ray, ray.next, lists);
+            fetch(ray.next);
         }
         return left;
     }
@@ -329,12 +335,11 @@ class Stream {
         const uint32_t rest = leaf + (WideNode::kMaxLeafBlocks - 1) * kBlocksPerStep;
         const uint32_t top = ray.top[-1];
         ray.top -= is_last & counts;
-        go_on(ray, rest ^ ((rest ^ top) & (0U - is_last)), lists, counts);
+        list(ray, rest ^ ((rest ^ top) & (0U - is_last)), lists, counts);
     }
 
-    /// Puts a ray on the list of what it does next, if `counts` is 1, and has the memory for that fetched where the
-    /// tree is large, without a branch on which.
-    HWY_INLINE void go_on(StreamRay& ray, uint32_t child, Lists& lists, uint32_t counts = 1) {
+    /// Puts a ray on the list of what it does next, if `counts` is 1, without a branch on which.
+    HWY_INLINE void list(StreamRay& ray, uint32_t child, Lists& lists, uint32_t counts = 1) {
         ray.next = child;
         static_assert(StreamRay::kNothing == 0);
         const uint32_t is_leaf = child >> 31;
@@ -345,9 +350,14 @@ class Stream {
         lists.at_leaf += is_leaf & counts;
         lists.at_node += (1 - is_leaf - is_end) & counts;
         lists.at_end += is_end & counts;
+    }
+
+    /// Has the memory for a child fetched where the tree is large, without a branch on what it is.
+    HWY_INLINE void fetch(uint32_t child) const {
         if (!fetches_) {
             return;
         }
+        const uint32_t is_leaf = child >> 31;
         const auto node = reinterpret_cast<uintptr_t>(nodes_ + child);
         const auto block = reinterpret_cast<uintptr_t>(blocks_ + WideNode::first_block(child));
         // A choice that compilers would make with a branch.
@@ -372,7 +382,6 @@ class Stream {
                 !kExact || ((verdict.certain >> lane & 1U) != 0 && lower >= ray.sure_start && upper <= ray.sure_end);
             if (is_sure && upper < ray.lower) {
                 ray.place = block * kBlockSize + lane;
-                ray.triangle = triangle_at(blocks_, ray.place);
                 ray.shorten(lower, upper);
                 taken = true;
                 if (kAnyHit) {
@@ -380,7 +389,8 @@ class Stream {
                 }
             } else if (kExact) {
                 // Mostly the triangle that the ray has hit, in another leaf.
-                const bool is_known = triangle_at(blocks_, block * kBlockSize + lane) == ray.triangle;
+                const bool is_known = ray.place != kNoPlace && triangle_at(blocks_, block * kBlockSize + lane) ==
+                                                                   triangle_at(blocks_, ray.place);
                 open |= is_known ? 0 : lanes & -lanes;
             }
         }
@@ -402,7 +412,6 @@ class Stream {
             Nearest nearest{ray.place, ray.lower, ray.upper};
             if (take_exactly(rays_[ray.number], blocks_, place, nearest)) {
                 ray.place = place;
-                ray.triangle = triangle_at(blocks_, place);
                 ray.shorten(nearest.lower, nearest.upper);
                 taken = true;
             }

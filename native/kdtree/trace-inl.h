@@ -29,6 +29,10 @@ template <class SomePacket, class Ends>
 HWY_NOINLINE bool trace_parts(SomePacket& packet, const Ray* rays, uint32_t first, Ends& ends) {
     uint32_t parts[SomePacket::kMostParts];
     const size_t count = packet.part(parts);
+    if (count == 0) {
+        return false;
+    }
+    ends.begin(first, SomePacket::kRays);
     for (size_t i = 0; i < count; ++i) {
         if (!packet.gather(rays, parts[i])) {
             return false;
@@ -39,11 +43,11 @@ HWY_NOINLINE bool trace_parts(SomePacket& packet, const Ray* rays, uint32_t firs
             ends.add(first + lane, packet.place(lane));
         }
     }
-    return count != 0;
+    return true;
 }
 
-/// Traces rays that belong together as packets and all others as a stream. Calls ends.add(ray, place) for each, or
-/// ends.add(first, packet) for those of a packet.
+/// Traces rays that belong together as packets and all others as a stream. Calls ends.add(first, packet) for the rays
+/// of a packet; for others first ends.begin(first, count), maybe more than once, and in the end ends.add(ray, place).
 template <bool kAnyHit, bool kExact, class Ends>
 HWY_INLINE void trace(const Tree& tree, std::span<const Ray> rays, Ends& ends) {
     constexpr size_t kChunk = 4096;
@@ -61,6 +65,7 @@ HWY_INLINE void trace(const Tree& tree, std::span<const Ray> rays, Ends& ends) {
                 packet.trace();
                 ends.add(static_cast<uint32_t>(i), packet);
             } else if (!is_full || !trace_parts(packet, &rays[i], static_cast<uint32_t>(i), ends)) {
+                ends.begin(static_cast<uint32_t>(i), std::min(kPacket, end - i));
                 for (size_t first = i; first < std::min(i + kPacket, end); first += RayBatch::kSize) {
                     batches[count++] = static_cast<uint32_t>(first);
                 }
@@ -82,6 +87,7 @@ template <bool kExact>
 struct BlockedRays {
     std::span<uint8_t> results;
 
+    HWY_INLINE void begin(uint32_t /*first*/, size_t /*count*/) {}
     HWY_INLINE void add(uint32_t ray, uint32_t place) { results[ray] = place != kNoPlace ? 1 : 0; }
     HWY_INLINE void add(uint32_t first, const Packet<true, kExact>& packet) {
         for (uint32_t lane = 0; lane < Packet<true, kExact>::kRays; ++lane) {

@@ -101,7 +101,7 @@ inline float extent_of(const Box3f& bounds) {
 }
 
 /// Distances are depths: measured along the direction's largest component, z, so depth = t |direction[z]|. They neither
-/// overflow nor underflow where t would. RayBatch fills rays in, four words at a time, but for the last two.
+/// overflow nor underflow where t would. RayBatch fills rays in, four words at a time, but for the last.
 struct alignas(16) TracedRay {
     // Box test: a plane's depth is plane * inverse + shift, see Slab.
     float inverse[3];
@@ -126,7 +126,6 @@ struct alignas(16) TracedRay {
     float lower;  ///< its true depth lies between these two
     float upper;
     uint32_t place;
-    uint32_t triangle;
 
     /// Takes in that a hit's depth lies between these two.
     void shorten(float from, float to) {
