@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// Rays made ready for the box test and the triangle test, a register of them at a time. Compiled once per instruction
-// set (see traversal.cpp).
+// Rays made ready for the box test and the triangle test, and tested against the root, a register of them at a time.
+// Compiled once per instruction set (see traversal.cpp).
 
 #if defined(ESPALIER_KDTREE_RAY_BATCH_INL_H_) == defined(HWY_TARGET_TOGGLE)
 #ifdef ESPALIER_KDTREE_RAY_BATCH_INL_H_
@@ -142,11 +142,12 @@ class RayBatch {
         }
     }
 
-    /// kSize rays from `rays` on.
-    HWY_INLINE void set_up(const Ray* rays) {
+    /// kSize rays from `rays` on. Returns those that meet children of the root, a bit for each.
+    HWY_INLINE uint32_t set_up(const Ray* rays, const WideNode& root) {
         V lean = hn::Zero(D());
+        uint32_t meeting = 0;
         for (size_t first = 0; first < kSize; first += kLanes) {
-            lean = hn::Max(lean, set_up_lanes(first, rays + first));
+            lean = hn::Max(lean, set_up_lanes(first, rays + first, root, meeting));
         }
         if constexpr (kAsksFirst) {
             if (const float most = hn::GetLane(hn::MaxOfLanes(D(), lean)); most > lean_) {
@@ -154,6 +155,7 @@ class RayBatch {
                 set_least_inside();
             }
         }
+        return meeting;
     }
 
     /// Where steps ask first, by size class of a block: no edge function of a triangle that a ray hits is less inside,
@@ -169,6 +171,22 @@ class RayBatch {
             hn::Store(hn::Load(d, quads_[quad] + 4 * lane), d, to + 4 * quad);
         }
         ray.place = kNoPlace;
+    }
+
+    HWY_INLINE ChildEntries root_entries(size_t lane) const {
+        const hn::CappedTag<float, 4> d;
+        const auto first = hn::Load(d, entries_[0] + 4 * lane);
+        const auto others = hn::Load(d, entries_[1] + 4 * lane);
+#if HWY_TARGET != HWY_SSE4 && HWY_TARGET != HWY_NEON
+        return {hn::Combine(hn::CappedTag<float, WideNode::kWidth>(), others, first)};
+#else
+        ChildEntries entries;
+        hn::Store(first, d, entries.depth);
+        hn::Store(others, d, entries.depth + 4);
+        const auto met = [&](auto depth) { return static_cast<uint32_t>(mask_bits(d, hn::Lt(depth, hn::Inf(d)))); };
+        entries.met = met(first) | met(others) << 4;
+        return entries;
+#endif
     }
 
  private:
@@ -187,7 +205,7 @@ class RayBatch {
     }
 
     /// Returns how far x and y of a corner may move by its z being rounded; infinitely far for what is no ray.
-    HWY_INLINE V set_up_lanes(size_t first, const Ray* rays) {
+    HWY_INLINE V set_up_lanes(size_t first, const Ray* rays, const WideNode& root, uint32_t& meeting) {
         const D d;
         const hn::RebindToUnsigned<D> du;
         const RayColumns<V> given(d, rays);
@@ -201,10 +219,12 @@ class RayBatch {
         V near_planes[3];
         V far_planes[3];
         auto octant = hn::Zero(du);
+        hn::Mask<D> is_negative[3];
         for (uint32_t axis = 0; axis < 3; ++axis) {
             const auto negative = hn::Lt(given.direction[axis], hn::Zero(d));
             const V own = hn::Max(hn::Abs(given.direction[axis]), hn::Mul(largest, hn::Set(d, 0x1p-25F)));
             const Slab<V> slab(given.origin[axis], hn::Div(largest, own), negative, extent_, farthest, hn::Zero(d));
+            is_negative[axis] = negative;
             inverse[axis] = slab.inverse;
             near_shift[axis] = slab.near_shift;
             far_shift[axis] = slab.far_shift;
@@ -237,6 +257,25 @@ class RayBatch {
         store(5, axes.pick(columns, 0), axes.pick(columns, 1), axes.pick(columns, 2), sx);
         store(6, axes.pick(given.origin, 0), axes.pick(given.origin, 1), axes.pick(given.origin, 2), sy);
         store(7, limits.sure_start, limits.sure_end, hn::Inf(d), hn::Mul(given.t_max, largest));
+        V nearest = hn::Inf(d);
+        for (size_t half = 0; half < 2; ++half) {
+            V entries[4];
+            for (size_t i = 0; i < 4; ++i) {
+                const size_t child = 4 * half + i;
+                BoxSpan<V> span{limits.start, limits.reach};
+                for (size_t axis = 0; axis < 3; ++axis) {
+                    const V lower = hn::Set(d, root.lower[axis][child]);
+                    const V upper = hn::Set(d, root.upper[axis][child]);
+                    span.cut(hn::IfThenElse(is_negative[axis], upper, lower),
+                             hn::IfThenElse(is_negative[axis], lower, upper), inverse[axis], near_shift[axis],
+                             far_shift[axis]);
+                }
+                entries[i] = span.entry_or_infinity();
+                nearest = hn::Min(nearest, entries[i]);
+            }
+            hn::StoreInterleaved4(entries[0], entries[1], entries[2], entries[3], d, entries_[half] + 4 * first);
+        }
+        meeting |= static_cast<uint32_t>(mask_bits(d, hn::Lt(nearest, hn::Inf(d)))) << first;
         // A ray that is no ray must not take hits from those beside it.
         const V lean = hn::Mul(slant, farthest_z);
         return hn::IfThenElse(hn::Le(lean, hn::Set(d, std::numeric_limits<float>::max())), lean, hn::Inf(d));
@@ -248,6 +287,7 @@ class RayBatch {
     float sizes_[SizeClasses::kCount];
     float least_inside_[SizeClasses::kCount] = {};
     alignas(64) float quads_[kQuads][4 * kSize];
+    alignas(64) float entries_[2][4 * kSize];  ///< into four of the root's children each
 };
 
 }  // namespace espalier::HWY_NAMESPACE

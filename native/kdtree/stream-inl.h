@@ -98,51 +98,50 @@ struct StreamRay : TracedRay {
     }
 };
 
-/// Stacks the children that the ray meets, nearer ones later.
-HWY_INLINE void visit_node(StreamRay& ray, const WideNode& node) {
-    const hn::CappedTag<float, WideNode::kWidth> d;
-    [[maybe_unused]] const hn::RebindToUnsigned<decltype(d)> du;
-    constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<float, WideNode::kWidth>());
-    const float* planes = node.lower[0];
-    static_assert(sizeof(node.lower) == 3 * WideNode::kWidth * sizeof(float));
-    [[maybe_unused]] alignas(32) float entries[WideNode::kWidth];
-    [[maybe_unused]] uint32_t met = 0;
-    for (size_t first = 0; first < WideNode::kWidth; first += kLanes) {
-        auto entry = hn::Set(d, ray.start);
-        auto exit = hn::Set(d, ray.reach);
-        for (int axis = 0; axis < 3; ++axis) {
-            const auto near = hn::Load(d, planes + ray.near_planes[axis] + first);
-            const auto far = hn::Load(d, planes + ray.far_planes[axis] + first);
-            const auto inverse = hn::Set(d, ray.inverse[axis]);
-            entry = hn::Max(hn::MulAdd(near, inverse, hn::Set(d, ray.near_shift[axis])), entry);
-            exit = hn::Min(hn::MulAdd(far, inverse, hn::Set(d, ray.far_shift[axis])), exit);
-        }
-        const auto meets = hn::Le(entry, hn::Mul(exit, hn::Set(d, 1 + 0x1p-21F)));
-#if HWY_TARGET != HWY_SSE4 && HWY_TARGET != HWY_NEON
-        // All eight in one register: permute by the octant's order and compress onto the stack, without a branch on
-        // their number.
-        static_assert(kLanes == WideNode::kWidth);
-        const auto ranks = hn::Shr(hn::Set(du, node.order[ray.octant]), hn::Mul(hn::Iota(du, 0), hn::Set(du, 3)));
-        const auto order = hn::IndicesFromVec(d, hn::And(ranks, hn::Set(du, 7)));
-        const auto child = hn::BitCast(du, hn::TableLookupLanes(hn::BitCast(d, hn::Load(du, node.child)), order));
-        const auto depth = hn::TableLookupLanes(hn::IfThenElse(meets, entry, hn::Inf(d)), order);
-        const auto stacked = hn::Lt(depth, hn::Inf(d));
-        ray.top += compress_pair(d, stacked, child, ray.top, depth, ray.top_depth());
-    }
-#else
-        hn::Store(entry, d, entries + first);
-        uint8_t bits[8] = {};
-        hn::StoreMaskBits(d, meets, bits);
-        met |= static_cast<uint32_t>(bits[0]) << first;
-    }
+/// Stacks the children that the ray enters, nearer ones later.
+HWY_INLINE void stack_children(StreamRay& ray, const WideNode& node, const ChildEntries& entries) {
     uint32_t order = node.order[ray.octant];
+#if HWY_TARGET != HWY_SSE4 && HWY_TARGET != HWY_NEON
+    // Permuted by the octant's order and compressed onto the stack, without a branch on their number.
+    const hn::CappedTag<float, WideNode::kWidth> d;
+    const hn::RebindToUnsigned<decltype(d)> du;
+    const auto ranks = hn::Shr(hn::Set(du, order), hn::Mul(hn::Iota(du, 0), hn::Set(du, 3)));
+    const auto slots = hn::IndicesFromVec(d, hn::And(ranks, hn::Set(du, 7)));
+    const auto child = hn::BitCast(du, hn::TableLookupLanes(hn::BitCast(d, hn::Load(du, node.child)), slots));
+    const auto depth = hn::TableLookupLanes(entries.depth, slots);
+    ray.top += compress_pair(d, hn::Lt(depth, hn::Inf(d)), child, ray.top, depth, ray.top_depth());
+#else
     for (int i = 0; i < WideNode::kWidth; ++i, order >>= 3) {
         const uint32_t slot = order & 7U;
         *ray.top = node.child[slot];
-        *ray.top_depth() = entries[slot];
-        ray.top += met >> slot & 1U;
+        *ray.top_depth() = entries.depth[slot];
+        ray.top += entries.met >> slot & 1U;
     }
 #endif
+}
+
+HWY_INLINE void visit_node(StreamRay& ray, const WideNode& node) {
+    const hn::CappedTag<float, WideNode::kWidth> d;
+    constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<float, WideNode::kWidth>());
+    const float* planes = node.lower[0];
+    static_assert(sizeof(node.lower) == 3 * WideNode::kWidth * sizeof(float));
+    ChildEntries entries;
+    for (size_t first = 0; first < WideNode::kWidth; first += kLanes) {
+        BoxSpan<hn::Vec<decltype(d)>> span{hn::Set(d, ray.start), hn::Set(d, ray.reach)};
+        for (int axis = 0; axis < 3; ++axis) {
+            span.cut(hn::Load(d, planes + ray.near_planes[axis] + first),
+                     hn::Load(d, planes + ray.far_planes[axis] + first), hn::Set(d, ray.inverse[axis]),
+                     hn::Set(d, ray.near_shift[axis]), hn::Set(d, ray.far_shift[axis]));
+        }
+#if HWY_TARGET != HWY_SSE4 && HWY_TARGET != HWY_NEON
+        static_assert(kLanes == WideNode::kWidth);
+        entries.depth = span.entry_or_infinity();
+#else
+        hn::Store(span.entry, d, entries.depth + first);
+        entries.met |= static_cast<uint32_t>(mask_bits(d, span.meets())) << first;
+#endif
+    }
+    stack_children(ray, node, entries);
 }
 
 /// Traces rays through a tree. For any hit a ray ends at the first.
@@ -157,7 +156,8 @@ class Stream {
           rays_(rays),
           batch_(tree.bounds) {}
 
-    /// Traces rays, batches of them from these numbers on, and calls done(ray) for each when its way has ended.
+    /// Traces rays, batches of them from these numbers on, and calls done(ray) for each when its way has ended, unless
+    /// it meets no child of the root.
     template <class Done>
     HWY_INLINE void run(std::span<const uint32_t> batches, const Done& done) {
         batches_ = batches;
@@ -269,31 +269,36 @@ class Stream {
 
     /// Puts the next ray, if there is one, in place of one that has ended.
     HWY_INLINE void begin(StreamRay& ray, Lists& lists) {
-        if (next_ == end_ && !set_up_next_batch()) {
+        if (waiting_ == 0 && !set_up_next_batch()) {
             return;
         }
-        batch_.copy(next_ % RayBatch::kSize, ray);
-        ray.number = next_++;
-        ray.next = 0;
+        const auto lane = static_cast<uint32_t>(std::countr_zero(waiting_));
+        waiting_ &= waiting_ - 1;
+        batch_.copy(lane, ray);
+        ray.number = first_ + lane;
         ray.clear_stack();
-        node_list_[lists.at_node++] = &ray;
+        stack_children(ray, nodes_[0], batch_.root_entries(lane));
+        // Not fetched: with as many rays going there, it is at hand.
+        list(ray, *--ray.top, lists);
     }
 
+    /// Of which some rays meet something: the others have missed.
     HWY_NOINLINE bool set_up_next_batch() {
-        if (batches_.empty()) {
-            return false;
-        }
-        next_ = batches_.front();
-        batches_ = batches_.subspan(1);
-        const std::span<const Ray> rays = rays_.subspan(next_, std::min(RayBatch::kSize, rays_.size() - next_));
-        end_ = next_ + static_cast<uint32_t>(rays.size());
-        if (rays.size() == RayBatch::kSize) {
-            batch_.set_up(rays.data());
-        } else {
-            Ray filled_up[RayBatch::kSize];
-            std::fill(std::copy(rays.begin(), rays.end(), filled_up), std::end(filled_up), rays.front());
-            batch_.set_up(filled_up);
-        }
+        do {
+            if (batches_.empty()) {
+                return false;
+            }
+            first_ = batches_.front();
+            batches_ = batches_.subspan(1);
+            const std::span<const Ray> rays = rays_.subspan(first_, std::min(RayBatch::kSize, rays_.size() - first_));
+            if (rays.size() == RayBatch::kSize) {
+                waiting_ = batch_.set_up(rays.data(), nodes_[0]);
+            } else {
+                Ray filled_up[RayBatch::kSize];
+                std::fill(std::copy(rays.begin(), rays.end(), filled_up), std::end(filled_up), rays.front());
+                waiting_ = batch_.set_up(filled_up, nodes_[0]) & ((1U << rays.size()) - 1);
+            }
+        } while (waiting_ == 0);
         return true;
     }
 
@@ -426,8 +431,8 @@ class Stream {
     std::span<const Ray> rays_;
     std::span<const uint32_t> batches_;  ///< those not yet set up, by the numbers of their first rays
     RayBatch batch_;
-    uint32_t next_ = 0;  ///< the next ray of the batch, and the end of it
-    uint32_t end_ = 0;
+    uint32_t first_ = 0;    ///< ray of the batch
+    uint32_t waiting_ = 0;  ///< those of it that are still to begin, a bit for each
     StreamRay* node_list_[kInFlight + 1];
     StreamRay* leaf_list_[kInFlight + 1];
     StreamRay* asked_list_[kInFlight + 1];    ///< and may meet something there

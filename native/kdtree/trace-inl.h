@@ -47,7 +47,8 @@ HWY_NOINLINE bool trace_parts(SomePacket& packet, const Ray* rays, uint32_t firs
 }
 
 /// Traces rays that belong together as packets and all others as a stream. Calls ends.add(first, packet) for the rays
-/// of a packet; for others first ends.begin(first, count), maybe more than once, and in the end ends.add(ray, place).
+/// of a packet; for others first ends.begin(first, count), maybe more than once, and ends.add(ray, place) for all that
+/// hit something.
 template <bool kAnyHit, bool kExact, class Ends>
 HWY_INLINE void trace(const Tree& tree, std::span<const Ray> rays, Ends& ends) {
     constexpr size_t kChunk = 4096;
@@ -87,7 +88,7 @@ template <bool kExact>
 struct BlockedRays {
     std::span<uint8_t> results;
 
-    HWY_INLINE void begin(uint32_t /*first*/, size_t /*count*/) {}
+    HWY_INLINE void begin(uint32_t first, size_t count) { std::fill_n(results.begin() + first, count, uint8_t{0}); }
     HWY_INLINE void add(uint32_t ray, uint32_t place) { results[ray] = place != kNoPlace ? 1 : 0; }
     HWY_INLINE void add(uint32_t first, const Packet<true, kExact>& packet) {
         for (uint32_t lane = 0; lane < Packet<true, kExact>::kRays; ++lane) {

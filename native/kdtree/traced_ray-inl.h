@@ -135,6 +135,34 @@ struct alignas(16) TracedRay {
     }
 };
 
+/// The depths between which rays lie inside boxes, a ray or a box per lane.
+template <class V>
+struct BoxSpan {
+    V entry;
+    V exit;
+
+    /// Takes in two planes across one axis.
+    HWY_INLINE void cut(V near, V far, V inverse, V near_shift, V far_shift) {
+        entry = hn::Max(hn::MulAdd(near, inverse, near_shift), entry);
+        exit = hn::Min(hn::MulAdd(far, inverse, far_shift), exit);
+    }
+
+    HWY_INLINE auto meets() const { return hn::Le(entry, hn::Mul(exit, hn::Set(hn::DFromV<V>(), 1 + 0x1p-21F))); }
+
+    /// Where the boxes are entered; infinitely far away where they are not.
+    HWY_INLINE V entry_or_infinity() const { return hn::IfThenElse(meets(), entry, hn::Inf(hn::DFromV<V>())); }
+};
+
+/// Where a ray enters a node's children.
+struct ChildEntries {
+#if HWY_TARGET != HWY_SSE4 && HWY_TARGET != HWY_NEON
+    hn::Vec<hn::CappedTag<float, WideNode::kWidth>> depth;  ///< infinite for those that it does not enter
+#else
+    alignas(16) float depth[WideNode::kWidth];
+    uint32_t met = 0;  ///< those that it enters, a bit for each
+#endif
+};
+
 }  // namespace espalier::HWY_NAMESPACE
 HWY_AFTER_NAMESPACE();
 #endif

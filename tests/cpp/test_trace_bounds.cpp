@@ -2,6 +2,9 @@
 // The tracer's inequalities of native/EXACTNESS.md, measured as in test_build_bounds.cpp.
 #include <gtest/gtest.h>
 
+#include <algorithm>
+#include <cstring>
+
 #include "exact_kit.h"
 #include "geometry/exact_hit.h"
 #include "geometry/expansion.h"
@@ -27,6 +30,8 @@ struct DepthsResult {
     float near[3], far[3];              ///< of the planes of a box
     float near_shift[3], far_shift[3];  ///< per axis
     float entry, exit;                  ///< of the box
+    float entry_of_child;               ///< of the root, whose box it is; infinite if it is not met
+    bool meets_root, meets_others;      ///< whose boxes are inverted
 };
 struct FilterResult {
     float side[3], bound;
@@ -57,23 +62,45 @@ HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
 namespace hn = hwy::HWY_NAMESPACE;
 
-inline TracedRay set_up(const Ray& ray, RayBatch& batch) {
+inline size_t lane_of(const Ray& ray) { return std::bit_cast<uint32_t>(ray.origin.x) / 3 % RayBatch::kSize; }
+
+/// Returns the rays of the batch that meet the root.
+inline uint32_t set_up(const Ray& ray, RayBatch& batch, const WideNode& root) {
     // Among rays that need no room.
     Ray rays[RayBatch::kSize];
     std::fill(std::begin(rays), std::end(rays), Ray{{}, 0, {1, 0, 0}, 0});
-    const size_t lane = std::bit_cast<uint32_t>(ray.origin.x) / 3 % RayBatch::kSize;
-    rays[lane] = ray;
-    batch.set_up(rays);
+    rays[lane_of(ray)] = ray;
+    return batch.set_up(rays, root);
+}
+
+inline TracedRay traced_by(const RayBatch& batch, const Ray& ray) {
     TracedRay traced;
-    batch.copy(lane, traced);
+    batch.copy(lane_of(ray), traced);
     return traced;
 }
 
 inline DepthsResult depths_of(const Ray& ray, float extent, const Box3f& box) {
     const hn::CappedTag<float, 4> d;
     RayBatch batch({{-extent, -extent, -extent}, {extent, extent, extent}});
-    const TracedRay traced = set_up(ray, batch);
+    const size_t lane = lane_of(ray);
+    const size_t child = (lane + 3) % WideNode::kWidth;
+    WideNode root{};
+    for (size_t axis = 0; axis < 3; ++axis) {
+        std::fill(std::begin(root.lower[axis]), std::end(root.lower[axis]), kInfinity);
+        std::fill(std::begin(root.upper[axis]), std::end(root.upper[axis]), -kInfinity);
+        root.lower[axis][child] = box.lower[static_cast<int>(axis)];
+        root.upper[axis][child] = box.upper[static_cast<int>(axis)];
+    }
+    const uint32_t meeting = set_up(ray, batch, root);
+    const TracedRay traced = traced_by(batch, ray);
     DepthsResult result;
+    const ChildEntries entries = batch.root_entries(lane);
+    float entry[WideNode::kWidth];
+    std::memcpy(entry, &entries, sizeof entry);
+    result.entry_of_child = entry[child];
+    result.meets_root = (meeting >> lane & 1U) != 0;
+    entry[child] = kInfinity;
+    result.meets_others = *std::min_element(std::begin(entry), std::end(entry)) < kInfinity;
     result.entry = traced.start;
     result.exit = traced.reach;
     for (int axis = 0; axis < 3; ++axis) {
@@ -115,8 +142,9 @@ inline FilterResult filter(const Ray& ray, const Vec3f (&corner)[3], const Box3f
     blocks[1].triangle[0] = size_class * kMaxTriangles;
     const TriangleBlock& block = blocks[1];
     RayBatch batch(bounds);
-    set_up({bounds.lower, 0, {1, 0, 0}, 0}, batch);  // as do those before it
-    const TracedRay traced = set_up(ray, batch);
+    set_up({bounds.lower, 0, {1, 0, 0}, 0}, batch, {});  // as do those before it
+    set_up(ray, batch, {});
+    const TracedRay traced = traced_by(batch, ray);
     const hn::CappedTag<float, kBlockSize> d;
     using V = hn::Vec<decltype(d)>;
     const ShearedRay<V> own = sheared_for_all(d, traced);
@@ -318,6 +346,9 @@ TEST_P(TraceBounds, OfTheBoxTestLetNoPointSlip) {
     Share room(named("entry beyond exit, 6"));
     uint32_t slipped = 0;
     uint32_t would_slip = 0;
+    uint32_t unlike_root = 0;
+    uint32_t met_behind = 0;
+    uint32_t boxes = 0;
     for (const auto& [low, high] : kRanges) {
         for (int i = 0; i < 6000; ++i) {
             Ray ray{random.point(low, high), 0, random.point(-3, 0), HUGE_VALF};
@@ -351,8 +382,17 @@ TEST_P(TraceBounds, OfTheBoxTestLetNoPointSlip) {
             if (extent > kMaxCoordinate) {
                 continue;
             }
+            ++boxes;
             const DepthsResult result = GetParam().depths_of(ray, extent, box);
             slipped += result.entry <= result.exit * (1 + 0x1p-21F) ? 0U : 1U;
+            unlike_root += result.meets_root && result.entry_of_child == result.entry && !result.meets_others ? 0U : 1U;
+            Ray turned = ray;
+            turned.direction = -ray.direction;
+            const DepthsResult back = GetParam().depths_of(turned, extent, box);
+            const bool meets = back.entry <= back.exit * (1 + 0x1p-21F);
+            met_behind += meets ? 1U : 0U;
+            unlike_root +=
+                back.meets_root == meets && back.entry_of_child == (meets ? back.entry : HUGE_VALF) ? 0U : 1U;
             if (result.exit > 0 && result.entry > result.exit) {
                 room.add(Exact(result.entry) - result.exit, Exact(result.exit) * Exact(0x1p-21));
             }
@@ -377,6 +417,8 @@ TEST_P(TraceBounds, OfTheBoxTestLetNoPointSlip) {
         }
     }
     EXPECT_EQ(slipped, 0U);
+    EXPECT_EQ(unlike_root, 0U) << "a batch of rays meets the root as a ray meets a node";
+    EXPECT_LT(met_behind, boxes / 2) << "of boxes behind them, rays meet only what is near";
     EXPECT_GT(would_slip, 100U) << "without margins rays would slip through: the cases are hard ones";
     EXPECT_LT(share.largest(), 1);
     EXPECT_GT(share.largest(), 0.2);
