@@ -14,6 +14,7 @@
 
 #include <array>
 #include <cstdint>
+#include <cstring>
 #include <type_traits>
 
 HWY_BEFORE_NAMESPACE();
@@ -40,10 +41,13 @@ HWY_INLINE uint64_t mask_bits(D d, hn::Mask<D> mask) {
     }
     (void)d;
 #else
-    // No more bytes than there are: eight, GCC 12 puts together in memory first.
+    // Of the eight bytes that Highway may write, only as many read as there are: GCC 12 put all together in memory.
     constexpr size_t kLanes = hn::MaxLanes(D());
-    std::conditional_t<(kLanes <= 8), uint8_t, std::conditional_t<(kLanes <= 16), uint16_t, uint32_t>> few = 0;
-    hn::StoreMaskBits(d, mask, reinterpret_cast<uint8_t*>(&few));
+    static_assert(kLanes <= 32);
+    std::conditional_t<(kLanes <= 8), uint8_t, std::conditional_t<(kLanes <= 16), uint16_t, uint32_t>> few;
+    uint8_t bytes[8];
+    hn::StoreMaskBits(d, mask, bytes);
+    std::memcpy(&few, bytes, sizeof few);
     bits = few;
 #endif
     return bits;

@@ -486,7 +486,7 @@ class Packet {
                 entry = hn::Max(hn::Min(in0, in1), entry);
                 exit = hn::Min(hn::Max(out0, out1), exit);
             }
-            const auto meets = hn::Le(entry, hn::Mul(exit, hn::Set(d8, 1 + 0x1p-21F)));
+            const auto meets = BoxSpan<decltype(entry)>{entry, exit}.meets();
 #if HWY_TARGET != HWY_SSE4 && HWY_TARGET != HWY_NEON
             const auto ranks = hn::Shr(hn::Set(du8, node.order[octant_]), hn::Mul(hn::Iota(du8, 0), hn::Set(du8, 3)));
             const auto slots = hn::And(ranks, hn::Set(du8, 7));
@@ -529,18 +529,13 @@ class Packet {
     HWY_INLINE bool any_enters(uint32_t place) const {
         const float* planes = nodes_[place / WideNode::kWidth].lower[0] + place % WideNode::kWidth;
         for (size_t lane = 0; lane < kRays; lane += kLanes) {
-            V entry = hn::Load(d, box_start_ + lane);
-            V exit = hn::Load(d, box_reach_ + lane);
+            BoxSpan<V> span{hn::Load(d, box_start_ + lane), hn::Load(d, box_reach_ + lane)};
             for (int axis = 0; axis < 3; ++axis) {
-                const V inverse = hn::Load(d, inverse_[axis] + lane);
-                entry = hn::Max(
-                    hn::MulAdd(hn::Set(d, planes[near_planes_[axis]]), inverse, hn::Load(d, near_shift_[axis] + lane)),
-                    entry);
-                exit = hn::Min(
-                    hn::MulAdd(hn::Set(d, planes[far_planes_[axis]]), inverse, hn::Load(d, far_shift_[axis] + lane)),
-                    exit);
+                span.cut(hn::Set(d, planes[near_planes_[axis]]), hn::Set(d, planes[far_planes_[axis]]),
+                         hn::Load(d, inverse_[axis] + lane), hn::Load(d, near_shift_[axis] + lane),
+                         hn::Load(d, far_shift_[axis] + lane));
             }
-            if (!hn::AllFalse(d, hn::Le(entry, hn::Mul(exit, hn::Set(d, 1 + 0x1p-21F))))) {
+            if (!hn::AllFalse(d, span.meets())) {
                 return true;
             }
         }

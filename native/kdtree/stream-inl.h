@@ -220,7 +220,7 @@ class Stream {
                         ray.prune();
                     }
                 }
-                // What it goes on to was fetched behind the test.
+                // What it goes on to was fetched behind the test, unless that lay beyond the hit.
                 leave(ray, met.leaf, lists);
             }
             const uint32_t ended = std::exchange(lists.at_end, 0);
@@ -291,13 +291,13 @@ class Stream {
             first_ = batches_.front();
             batches_ = batches_.subspan(1);
             const std::span<const Ray> rays = rays_.subspan(first_, std::min(RayBatch::kSize, rays_.size() - first_));
-            if (rays.size() == RayBatch::kSize) {
-                waiting_ = batch_.set_up(rays.data(), nodes_[0]);
-            } else {
-                Ray filled_up[RayBatch::kSize];
+            const Ray* batch = rays.data();
+            Ray filled_up[RayBatch::kSize];
+            if (rays.size() < RayBatch::kSize) {
                 std::fill(std::copy(rays.begin(), rays.end(), filled_up), std::end(filled_up), rays.front());
-                waiting_ = batch_.set_up(filled_up, nodes_[0]) & ((1U << rays.size()) - 1);
+                batch = filled_up;
             }
+            waiting_ = batch_.set_up(batch, nodes_[0]) & ((1U << rays.size()) - 1);
         } while (waiting_ == 0);
         return true;
     }

@@ -24,7 +24,7 @@ HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
 
 /// Traces rays that are no packet as a few that are, one after the other, if there are such. Returns whether it has
-/// traced all; if not, some may have been, and come to the same end once more.
+/// traced all; if not, some may have been, and come to the same end once more (without exactness, to one of two).
 template <class SomePacket, class Ends>
 HWY_NOINLINE bool trace_parts(SomePacket& packet, const Ray* rays, uint32_t first, Ends& ends) {
     uint32_t parts[SomePacket::kMostParts];
