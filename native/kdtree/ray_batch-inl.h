@@ -221,14 +221,14 @@ class RayBatch {
         auto octant = hn::Zero(du);
         hn::Mask<D> is_negative[3];
         for (uint32_t axis = 0; axis < 3; ++axis) {
-            const auto negative = hn::Lt(given.direction[axis], hn::Zero(d));
+            is_negative[axis] = hn::Lt(given.direction[axis], hn::Zero(d));
             const V own = hn::Max(hn::Abs(given.direction[axis]), hn::Mul(largest, hn::Set(d, 0x1p-25F)));
-            const Slab<V> slab(given.origin[axis], hn::Div(largest, own), negative, extent_, farthest, hn::Zero(d));
-            is_negative[axis] = negative;
+            const Slab<V> slab(given.origin[axis], hn::Div(largest, own), is_negative[axis], extent_, farthest,
+                               hn::Zero(d));
             inverse[axis] = slab.inverse;
             near_shift[axis] = slab.near_shift;
             far_shift[axis] = slab.far_shift;
-            const auto negative_u = hn::RebindMask(du, negative);
+            const auto negative_u = hn::RebindMask(du, is_negative[axis]);
             octant = hn::Or(octant, hn::IfThenElseZero(negative_u, hn::Set(du, 1U << axis)));
             const auto first_planes = hn::Set(du, axis * WideNode::kWidth);
             const auto other_planes = hn::Set(du, (axis + 3) * WideNode::kWidth);
@@ -257,6 +257,17 @@ class RayBatch {
         store(5, axes.pick(columns, 0), axes.pick(columns, 1), axes.pick(columns, 2), sx);
         store(6, axes.pick(given.origin, 0), axes.pick(given.origin, 1), axes.pick(given.origin, 2), sy);
         store(7, limits.sure_start, limits.sure_end, hn::Inf(d), hn::Mul(given.t_max, largest));
+        meeting |= enter_root(first, root, is_negative, inverse, near_shift, far_shift, limits) << first;
+        // A ray that is no ray must not take hits from those beside it.
+        const V lean = hn::Mul(slant, farthest_z);
+        return hn::IfThenElse(hn::Le(lean, hn::Set(d, std::numeric_limits<float>::max())), lean, hn::Inf(d));
+    }
+
+    /// Notes where rays enter the root's children. Returns those that enter some, a bit for each.
+    HWY_INLINE uint32_t enter_root(size_t first, const WideNode& root, const hn::Mask<D> (&is_negative)[3],
+                                   const V (&inverse)[3], const V (&near_shift)[3], const V (&far_shift)[3],
+                                   const DepthLimits<V>& limits) {
+        const D d;
         V nearest = hn::Inf(d);
         for (size_t half = 0; half < 2; ++half) {
             V entries[4];
@@ -275,10 +286,7 @@ class RayBatch {
             }
             hn::StoreInterleaved4(entries[0], entries[1], entries[2], entries[3], d, entries_[half] + 4 * first);
         }
-        meeting |= static_cast<uint32_t>(mask_bits(d, hn::Lt(nearest, hn::Inf(d)))) << first;
-        // A ray that is no ray must not take hits from those beside it.
-        const V lean = hn::Mul(slant, farthest_z);
-        return hn::IfThenElse(hn::Le(lean, hn::Set(d, std::numeric_limits<float>::max())), lean, hn::Inf(d));
+        return static_cast<uint32_t>(mask_bits(d, hn::Lt(nearest, hn::Inf(d))));
     }
 
     Box3f bounds_;

@@ -138,7 +138,7 @@ HWY_INLINE void visit_node(StreamRay& ray, const WideNode& node) {
         entries.depth = span.entry_or_infinity();
 #else
         hn::Store(span.entry, d, entries.depth + first);
-        entries.met |= static_cast<uint32_t>(mask_bits(d, span.meets())) << first;
+        entries.met |= mask_bits(d, span.meets()) << first;
 #endif
     }
     stack_children(ray, node, entries);

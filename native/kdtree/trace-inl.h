@@ -24,15 +24,11 @@ HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
 
 /// Traces rays that are no packet as a few that are, one after the other, if there are such. Returns whether it has
-/// traced all; if not, some may have been, and come to the same end once more (without exactness, to one of two).
+/// traced all; if not, some may have been, and come to the same end once more.
 template <class SomePacket, class Ends>
 HWY_NOINLINE bool trace_parts(SomePacket& packet, const Ray* rays, uint32_t first, Ends& ends) {
     uint32_t parts[SomePacket::kMostParts];
     const size_t count = packet.part(parts);
-    if (count == 0) {
-        return false;
-    }
-    ends.begin(first, SomePacket::kRays);
     for (size_t i = 0; i < count; ++i) {
         if (!packet.gather(rays, parts[i])) {
             return false;
@@ -43,12 +39,12 @@ HWY_NOINLINE bool trace_parts(SomePacket& packet, const Ray* rays, uint32_t firs
             ends.add(first + lane, packet.place(lane));
         }
     }
-    return true;
+    return count != 0;
 }
 
 /// Traces rays that belong together as packets and all others as a stream. Calls ends.add(first, packet) for the rays
-/// of a packet; for others first ends.begin(first, count), maybe more than once, and ends.add(ray, place) for all that
-/// hit something.
+/// of a packet; for others first ends.begin(first, count), and then ends.add(ray, place) at least for all that hit
+/// something.
 template <bool kAnyHit, bool kExact, class Ends>
 HWY_INLINE void trace(const Tree& tree, std::span<const Ray> rays, Ends& ends) {
     constexpr size_t kChunk = 4096;
@@ -65,8 +61,10 @@ HWY_INLINE void trace(const Tree& tree, std::span<const Ray> rays, Ends& ends) {
             if (is_full && packet.gather(&rays[i])) {
                 packet.trace();
                 ends.add(static_cast<uint32_t>(i), packet);
-            } else if (!is_full || !trace_parts(packet, &rays[i], static_cast<uint32_t>(i), ends)) {
-                ends.begin(static_cast<uint32_t>(i), std::min(kPacket, end - i));
+                continue;
+            }
+            ends.begin(static_cast<uint32_t>(i), std::min(kPacket, end - i));
+            if (!is_full || !trace_parts(packet, &rays[i], static_cast<uint32_t>(i), ends)) {
                 for (size_t first = i; first < std::min(i + kPacket, end); first += RayBatch::kSize) {
                     batches[count++] = static_cast<uint32_t>(first);
                 }

@@ -404,19 +404,16 @@ TEST_P(TraceBounds, OfTheBoxTestLetNoPointSlip) {
             ++boxes;
             const DepthsResult result = GetParam().depths_of(ray, extent, box);
             slipped += result.entry <= result.exit * (1 + 0x1p-21F) ? 0U : 1U;
-            unlike_root += result.meets_root && result.entry_of_child == result.entry && !result.meets_others &&
-                                   result.is_like_a_node
-                               ? 0U
-                               : 1U;
             Ray turned = ray;
             turned.direction = -ray.direction;
             const DepthsResult back = GetParam().depths_of(turned, extent, box);
-            const bool meets = back.entry <= back.exit * (1 + 0x1p-21F);
-            met_behind += meets ? 1U : 0U;
-            unlike_root += back.meets_root == meets && back.entry_of_child == (meets ? back.entry : HUGE_VALF) &&
-                                   back.is_like_a_node
-                               ? 0U
-                               : 1U;
+            met_behind += back.meets_root ? 1U : 0U;
+            for (const DepthsResult& r : {result, back}) {
+                const bool meets = r.entry <= r.exit * (1 + 0x1p-21F);
+                const bool is_alike = r.meets_root == meets && r.entry_of_child == (meets ? r.entry : HUGE_VALF) &&
+                                      !r.meets_others && r.is_like_a_node;
+                unlike_root += is_alike ? 0U : 1U;
+            }
             if (result.exit > 0 && result.entry > result.exit) {
                 room.add(Exact(result.entry) - result.exit, Exact(result.exit) * Exact(0x1p-21));
             }
