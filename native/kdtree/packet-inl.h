@@ -630,9 +630,9 @@ class Packet {
         const ShearedRay<V> own{focus_.x,
                                 focus_.y,
                                 focus_.z,
-                                hn::Load(d, origin_[focus_.x / kBlockSize] + lane),
-                                hn::Load(d, origin_[focus_.y / kBlockSize] + lane),
-                                hn::Load(d, origin_[focus_.z / kBlockSize] + lane),
+                                hn::Neg(hn::Load(d, origin_[focus_.x / kBlockSize] + lane)),
+                                hn::Neg(hn::Load(d, origin_[focus_.y / kBlockSize] + lane)),
+                                hn::Neg(hn::Load(d, origin_[focus_.z / kBlockSize] + lane)),
                                 hn::Load(d, own_slope_x_ + lane),
                                 hn::Load(d, own_slope_y_ + lane),
                                 hn::Load(d, slant_ + lane)};
@@ -699,7 +699,7 @@ class Packet {
         place_[lane] = place;
         triangle_[lane] = triangle;
         sure_before_[lane] = std::min(sure_before_[lane], nearest.lower);
-        reaches_[lane] = kAnyHit ? -1.0F : nearest.upper * (1 + 0x1p-20F) + kTiny;
+        reaches_[lane] = kAnyHit ? -1.0F : reach_behind(nearest.upper);
         box_reach_[lane] = reaches_[lane];
         return true;
     }

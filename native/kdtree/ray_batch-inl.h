@@ -11,6 +11,8 @@
 
 #include <hwy/highway.h>
 
+#include <algorithm>
+#include <bit>
 #include <cstdint>
 #include <limits>
 
@@ -170,7 +172,77 @@ class RayBatch {
         for (size_t quad = 0; quad < kQuads; ++quad) {
             hn::Store(hn::Load(d, quads_[quad] + 4 * lane), d, to + 4 * quad);
         }
-        ray.place = kNoPlace;
+        ray.place = place_[lane];
+    }
+
+    /// What the triangle test asks of a ray, as in TracedRay, and what holds for all triangles of the tree.
+    struct AtLeaf {
+        uint32_t x, y, z;
+        float minus_ox, minus_oy, minus_oz;
+        float sx, sy;
+        float slant, sign, start, reach;
+        float minus_edge_error;  ///< no Sheared::minus_edge_error is less
+        float mz;                ///< no corner's |z| is larger
+    };
+
+    HWY_INLINE AtLeaf at_leaf(size_t lane) const {
+        const auto number = [&](size_t quad, size_t i) { return quads_[quad][4 * lane + i]; };
+        const auto offset = [&](size_t i) { return std::bit_cast<uint32_t>(number(5, i)); };
+        return {offset(0),
+                offset(1),
+                offset(2),
+                number(6, 0),
+                number(6, 1),
+                number(6, 2),
+                number(5, 3),
+                number(6, 3),
+                number(4, 3),
+                number(3, 3),
+                number(0, 3),
+                number(1, 3),
+                minus_edge_error_[lane],
+                mz_[lane]};
+    }
+
+    /// Whether a depth between these two lies within the ray's limits for certain.
+    HWY_INLINE bool is_within(size_t lane, float lower, float upper) const {
+        return lower >= quads_[7][4 * lane] && upper <= quads_[7][4 * lane + 1];
+    }
+
+    /// The child of the root that a ray enters first, of one that enters some.
+    uint32_t first_child(size_t lane) const { return first_child_[lane]; }
+
+    /// Of the rays that enter some, those whose first is one of these; a bit for each ray and each child.
+    HWY_INLINE uint32_t first_in(uint32_t children) const {
+        const hn::RebindToUnsigned<D> du;
+        uint32_t lanes = 0;
+        for (size_t first = 0; first < kSize; first += kLanes) {
+            const auto child = hn::Shl(hn::Set(du, 1), hn::Load(du, first_child_ + first));
+            const auto is_among = hn::Ne(hn::And(child, hn::Set(du, children)), hn::Zero(du));
+            lanes |= static_cast<uint32_t>(mask_bits(D(), hn::RebindMask(D(), is_among))) << first;
+        }
+        return lanes;
+    }
+
+    /// The children of the root that a ray enters no farther than `reach`, a bit for each.
+    HWY_INLINE uint32_t entered(size_t lane, float reach) const {
+        const hn::CappedTag<float, 4> d;
+        const auto limit = hn::Set(d, std::min(reach, std::numeric_limits<float>::max()));
+        const auto bits = [&](size_t half) {
+            return static_cast<uint32_t>(mask_bits(d, hn::Le(hn::Load(d, entries_[half] + 4 * lane), limit)));
+        };
+        return bits(0) | bits(1) << 4;
+    }
+
+    /// Has a ray pass a child of the root by.
+    void pass_by(size_t lane, uint32_t child) { entries_[child / 4][4 * lane + child % 4] = kInfinity; }
+
+    /// Takes in that a ray hits something, at a depth between these two.
+    HWY_INLINE void shorten(size_t lane, uint32_t place, float lower, float upper) {
+        quads_[1][4 * lane + 3] = reach_behind(upper);
+        quads_[7][4 * lane + 2] = lower;
+        quads_[7][4 * lane + 3] = upper;
+        place_[lane] = place;
     }
 
     HWY_INLINE ChildEntries root_entries(size_t lane) const {
@@ -255,11 +327,16 @@ class RayBatch {
         store(3, near_planes[0], near_planes[1], near_planes[2], hn::CopySign(hn::Set(d, 1.0F), along));
         store(4, far_planes[0], far_planes[1], far_planes[2], slant);
         store(5, axes.pick(columns, 0), axes.pick(columns, 1), axes.pick(columns, 2), sx);
-        store(6, axes.pick(given.origin, 0), axes.pick(given.origin, 1), axes.pick(given.origin, 2), sy);
+        const V minus_origin[3] = {hn::Neg(given.origin[0]), hn::Neg(given.origin[1]), hn::Neg(given.origin[2])};
+        store(6, axes.pick(minus_origin, 0), axes.pick(minus_origin, 1), axes.pick(minus_origin, 2), sy);
         store(7, limits.sure_start, limits.sure_end, hn::Inf(d), hn::Mul(given.t_max, largest));
+        hn::Store(hn::Set(du, kNoPlace), du, place_ + first);
+        hn::Store(farthest_z, d, mz_ + first);
         meeting |= enter_root(first, root, is_negative, inverse, near_shift, far_shift, limits) << first;
         // A ray that is no ray must not take hits from those beside it.
         const V lean = hn::Mul(slant, farthest_z);
+        hn::Store(minus_edge_error_within(hn::Mul(hn::Set(d, 4.0625F), farthest_z), lean), d,
+                  minus_edge_error_ + first);
         return hn::IfThenElse(hn::Le(lean, hn::Set(d, std::numeric_limits<float>::max())), lean, hn::Inf(d));
     }
 
@@ -268,7 +345,9 @@ class RayBatch {
                                    const V (&inverse)[3], const V (&near_shift)[3], const V (&far_shift)[3],
                                    const DepthLimits<V>& limits) {
         const D d;
+        const hn::RebindToUnsigned<D> du;
         V nearest = hn::Inf(d);
+        auto first_child = hn::Zero(du);
         for (size_t half = 0; half < 2; ++half) {
             V entries[4];
             for (size_t i = 0; i < 4; ++i) {
@@ -282,10 +361,13 @@ class RayBatch {
                              far_shift[axis]);
                 }
                 entries[i] = span.entry_or_infinity();
+                const auto is_nearer = hn::RebindMask(du, hn::Lt(entries[i], nearest));
+                first_child = hn::IfThenElse(is_nearer, hn::Set(du, static_cast<uint32_t>(child)), first_child);
                 nearest = hn::Min(nearest, entries[i]);
             }
             hn::StoreInterleaved4(entries[0], entries[1], entries[2], entries[3], d, entries_[half] + 4 * first);
         }
+        hn::Store(first_child, du, first_child_ + first);
         return static_cast<uint32_t>(mask_bits(d, hn::Lt(nearest, hn::Inf(d))));
     }
 
@@ -295,7 +377,11 @@ class RayBatch {
     float sizes_[SizeClasses::kCount];
     float least_inside_[SizeClasses::kCount] = {};
     alignas(64) float quads_[kQuads][4 * kSize];
+    alignas(64) uint32_t place_[kSize];
+    alignas(64) float minus_edge_error_[kSize];
+    alignas(64) float mz_[kSize];
     alignas(64) float entries_[2][4 * kSize];  ///< into four of the root's children each
+    alignas(64) uint32_t first_child_[kSize];
 };
 
 }  // namespace espalier::HWY_NAMESPACE

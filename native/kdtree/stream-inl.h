@@ -19,6 +19,7 @@
 #include <utility>
 
 #include "kdtree/ray_batch-inl.h"
+#include "kdtree/root_leaves-inl.h"
 #include "kdtree/traced_ray-inl.h"
 #include "kdtree/triangle_test-inl.h"
 
@@ -154,17 +155,18 @@ class Stream {
           on_demand_(tree.on_demand.get()),
           fetches_(tree.wide_nodes.bytes() + tree.blocks.bytes() > kCached),
           rays_(rays),
-          batch_(tree.bounds) {}
+          batch_(tree.bounds),
+          root_leaves_(nodes_[0], blocks_) {}
 
-    /// Traces rays, batches of them from these numbers on, and calls done(ray) for each when its way has ended, unless
-    /// it meets no child of the root.
+    /// Traces rays, batches of them from these numbers on, and calls done(number, place) at least for each that hits
+    /// something, when its way has ended.
     template <class Done>
     HWY_INLINE void run(std::span<const uint32_t> batches, const Done& done) {
         batches_ = batches;
         batch_.reset();
         Lists lists;
         for (uint32_t slot = 0; slot < kInFlight; ++slot) {
-            begin(ray_[slot], lists);
+            begin(ray_[slot], lists, done);
         }
         while ((lists.at_node | lists.at_leaf | lists.at_end) != 0) {
             // Each list is read from its front while rays are put behind; as each ray is put back once at most, a list
@@ -231,8 +233,8 @@ class Stream {
                     list(ray, *--ray.top, lists);
                     continue;
                 }
-                done(ray);
-                begin(ray, lists);
+                done(ray.number, ray.place);
+                begin(ray, lists, done);
             }
         }
     }
@@ -264,12 +266,10 @@ class Stream {
         uint32_t possible;
     };
 
-    /// 0 for 0, 1 for all other numbers below 2^31, without a branch.
-    static HWY_INLINE uint32_t at_most_one(uint32_t number) { return (0U - number) >> 31; }
-
     /// Puts the next ray, if there is one, in place of one that has ended.
-    HWY_INLINE void begin(StreamRay& ray, Lists& lists) {
-        if (waiting_ == 0 && !set_up_next_batch()) {
+    template <class Done>
+    HWY_INLINE void begin(StreamRay& ray, Lists& lists, const Done& done) {
+        if (waiting_ == 0 && !set_up_next_batch(done)) {
             return;
         }
         const auto lane = static_cast<uint32_t>(std::countr_zero(waiting_));
@@ -282,8 +282,9 @@ class Stream {
         list(ray, *--ray.top, lists);
     }
 
-    /// Of which some rays meet something: the others have missed.
-    HWY_NOINLINE bool set_up_next_batch() {
+    /// Of which some rays have to be followed: the others have missed, or ended in a leaf below the root.
+    template <class Done>
+    HWY_NOINLINE bool set_up_next_batch(const Done& done) {
         do {
             if (batches_.empty()) {
                 return false;
@@ -298,6 +299,8 @@ class Stream {
                 batch = filled_up;
             }
             waiting_ = batch_.set_up(batch, nodes_[0]) & ((1U << rays.size()) - 1);
+            waiting_ = root_leaves_.visit(batch_, waiting_,
+                                          [&](uint32_t lane, uint32_t place) { done(first_ + lane, place); });
         } while (waiting_ == 0);
         return true;
     }
@@ -431,6 +434,7 @@ class Stream {
     std::span<const Ray> rays_;
     std::span<const uint32_t> batches_;  ///< those not yet set up, by the numbers of their first rays
     RayBatch batch_;
+    RootLeaves<kAnyHit, kExact> root_leaves_;
     uint32_t first_ = 0;    ///< ray of the batch
     uint32_t waiting_ = 0;  ///< those of it that are still to begin, a bit for each
     StreamRay* node_list_[kInFlight + 1];

@@ -70,7 +70,7 @@ HWY_INLINE void trace(const Tree& tree, std::span<const Ray> rays, Ends& ends) {
                 }
             }
         }
-        stream.run({batches, count}, [&](const StreamRay& ray) { ends.add(ray.number, ray.place); });
+        stream.run({batches, count}, [&](uint32_t ray, uint32_t place) { ends.add(ray, place); });
     }
 }
 

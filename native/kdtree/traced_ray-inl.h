@@ -38,6 +38,9 @@ HWY_INLINE hn::Mask<D> mask_of(D d, uint32_t bits) {
     return hn::LoadMaskBits(d, reinterpret_cast<const uint8_t*>(&room));
 }
 
+/// 0 for 0, 1 for all other numbers below 2^31, without a branch.
+HWY_INLINE uint32_t at_most_one(uint32_t number) { return (0U - number) >> 31; }
+
 /// Has so many lines of 64 bytes fetched. A number known when compiling: a loop that is not unrolled costs more than it
 /// gains.
 template <size_t kLines>
@@ -100,8 +103,11 @@ inline float extent_of(const Box3f& bounds) {
     return extent;
 }
 
+/// How far a ray has to be followed that has a hit no farther than `upper`.
+HWY_INLINE float reach_behind(float upper) { return upper * (1 + 0x1p-20F) + kTiny; }
+
 /// Distances are depths: measured along the direction's largest component, z, so depth = t |direction[z]|. They neither
-/// overflow nor underflow where t would. RayBatch fills rays in, four words at a time, but for the last.
+/// overflow nor underflow where t would. RayBatch fills rays in, four words at a time.
 struct alignas(16) TracedRay {
     // Box test: a plane's depth is plane * inverse + shift, see Slab.
     float inverse[3];
@@ -118,7 +124,7 @@ struct alignas(16) TracedRay {
     float slant;       ///< how much a corner's z, rounded, moves its x and y
     uint32_t x, y, z;  ///< from a corner's first float to its coordinates on that axis
     float sx;
-    float ox, oy, oz;  ///< the origin, permuted
+    float minus_ox, minus_oy, minus_oz;  ///< the origin, permuted, negative: a sum reads its other part from memory
     float sy;
     float sure_start;  ///< a depth not below this lies beyond t_min for certain
     float sure_end;    ///< nor one above this beyond t_max
@@ -131,7 +137,7 @@ struct alignas(16) TracedRay {
     void shorten(float from, float to) {
         lower = from;
         upper = to;
-        reach = to * (1 + 0x1p-20F) + kTiny;
+        reach = reach_behind(to);
     }
 };
 

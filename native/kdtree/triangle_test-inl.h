@@ -62,22 +62,32 @@ class BlockLoader {
 template <class V>
 struct ShearedRay {
     uint32_t x, y, z;  ///< as in TracedRay, and so are the others
-    V ox, oy, oz;
+    V minus_ox, minus_oy, minus_oz;
     V sx, sy;
     V slant;
 };
 
-template <class D>
-HWY_INLINE ShearedRay<hn::Vec<D>> sheared_for_all(D d, const TracedRay& ray) {
+template <class D, class SomeRay>
+HWY_INLINE ShearedRay<hn::Vec<D>> sheared_for_all(D d, const SomeRay& ray) {
     return {ray.x,
             ray.y,
             ray.z,
-            hn::Set(d, ray.ox),
-            hn::Set(d, ray.oy),
-            hn::Set(d, ray.oz),
+            hn::Set(d, ray.minus_ox),
+            hn::Set(d, ray.minus_oy),
+            hn::Set(d, ray.minus_oz),
             hn::Set(d, ray.sx),
             hn::Set(d, ray.sy),
             hn::Set(d, ray.slant)};
+}
+
+/// Less than minus the error of any edge function of corners whose largest |x| and |y| make up `sum`; lean: how far
+/// they may move by their z being rounded. EXACTNESS.md, 8.
+template <class V>
+HWY_INLINE V minus_edge_error_within(V sum, V lean) {
+    const hn::DFromV<V> d;
+    const V s = hn::MulAdd(hn::Set(d, 5.5F), lean, sum);
+    const V slope = hn::MulAdd(hn::Set(d, 10.5F), lean, hn::Mul(hn::Set(d, 3.25F * 0x1p-24F), s));
+    return hn::NegMulSub(s, slope, hn::Set(d, kTiny));
 }
 
 /// Triangles as a ray sees them, along +z through the origin, and their edge functions: the weights of the corners.
@@ -92,23 +102,18 @@ struct Sheared {
     template <class Load>
     HWY_INLINE Sheared(const ShearedRay<V>& ray, const Load& load) {
         for (size_t k = 0; k < 3; ++k) {
-            z[k] = hn::Sub(load(k, ray.z), ray.oz);
-            x[k] = hn::NegMulAdd(ray.sx, z[k], hn::Sub(load(k, ray.x), ray.ox));
-            y[k] = hn::NegMulAdd(ray.sy, z[k], hn::Sub(load(k, ray.y), ray.oy));
+            z[k] = hn::Add(ray.minus_oz, load(k, ray.z));
+            x[k] = hn::NegMulAdd(ray.sx, z[k], hn::Add(ray.minus_ox, load(k, ray.x)));
+            y[k] = hn::NegMulAdd(ray.sy, z[k], hn::Add(ray.minus_oy, load(k, ray.y)));
         }
         side[0] = hn::MulSub(x[2], y[1], hn::Mul(y[2], x[1]));
         side[1] = hn::MulSub(x[0], y[2], hn::Mul(y[0], x[2]));
         side[2] = hn::MulSub(x[1], y[0], hn::Mul(y[1], x[0]));
     }
 
-    /// Less than minus the error of any of the three edge functions; mz: the largest |z| of the corners. EXACTNESS.md,
-    /// 8.
+    /// Less than minus the error of any of the three edge functions; mz: the largest |z| of the corners.
     HWY_INLINE V minus_edge_error(V slant, V mz) const {
-        const hn::DFromV<V> d;
-        const V lean = hn::Mul(slant, mz);
-        const V s = hn::MulAdd(hn::Set(d, 5.5F), lean, hn::Add(largest_of(x), largest_of(y)));
-        const V slope = hn::MulAdd(hn::Set(d, 10.5F), lean, hn::Mul(hn::Set(d, 3.25F * 0x1p-24F), s));
-        return hn::NegMulSub(s, slope, hn::Set(d, kTiny));
+        return minus_edge_error_within(hn::Add(largest_of(x), largest_of(y)), hn::Mul(slant, mz));
     }
 };
 
@@ -166,8 +171,8 @@ HWY_INLINE DepthRange<V> depth_range(const V (&side)[3], V bound, V mz, V z0, V 
 
 /// The lanes of a block that the ray may hit, by whatever depth, and others that come near; least_inside_of_class: as
 /// RayBatch has it.
-template <bool kExact>
-HWY_INLINE uint32_t lanes_in_question(const TracedRay& ray, const TriangleBlock& block,
+template <bool kExact, class SomeRay>
+HWY_INLINE uint32_t lanes_in_question(const SomeRay& ray, const TriangleBlock& block,
                                       const float* least_inside_of_class) {
     const hn::CappedTag<float, kBlockSize> d;
     constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<float, kBlockSize>());
@@ -184,8 +189,16 @@ HWY_INLINE uint32_t lanes_in_question(const TracedRay& ray, const TriangleBlock&
     return lanes;
 }
 
-/// The lanes of a block, and of the one behind it where a step takes two, that the ray may hit within [start, reach];
-/// every lane that it does hit is among them.
+/// Of triangles as Sheared has them, what their errors are found by.
+template <class V>
+struct EdgeLimits {
+    V minus_error;  ///< no edge function is off by more
+    V mz;           ///< no corner's |z| is larger
+};
+
+/// The lanes of a step's triangles that the ray may hit within [start, reach]; every lane that it does hit is among
+/// them. load(from): coordinates that lie so many floats behind those of the first corners on the first axis;
+/// limits(seen): the EdgeLimits of triangles, as Sheared has them.
 ///
 /// With u = 2^-24, mx, my, mz the largest |x|, |y| and |z| of the corners seen from the origin, and n what the shear
 /// makes of mz: a sheared coordinate is off by at most u (2 mx + 5 n), since the shear carries one rounding, z one,
@@ -194,12 +207,11 @@ HWY_INLINE uint32_t lanes_in_question(const TracedRay& ray, const TriangleBlock&
 /// that is less than u s (3.1 s + 10.1 n), and `bound` lies above by more than the roundings of its own sum. Fused
 /// operations only leave roundings out. Underflow adds less than kTiny: a product's is below 2^-149, and a coordinate's
 /// counts by at most 2^-149 s, which u s^2 outweighs from s = 2^-125 on.
-template <bool kExact>
-HWY_INLINE uint32_t test_blocks(const TracedRay& ray, const TriangleBlock* block, uint32_t second, Verdict& verdict) {
+template <bool kExact, class SomeRay, class Load, class Limits>
+HWY_INLINE uint32_t test_lanes(const SomeRay& ray, const Load& load, const Limits& limits, Verdict& verdict) {
     const hn::CappedTag<float, kBlocksPerStep * kBlockSize> d;
     constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<float, kBlocksPerStep * kBlockSize>());
     using V = hn::Vec<decltype(d)>;
-    const BlockLoader load(block, second);
     const ShearedRay<V> sheared = sheared_for_all(d, ray);
     uint32_t possible = 0;
     uint32_t certain = 0;
@@ -207,17 +219,15 @@ HWY_INLINE uint32_t test_blocks(const TracedRay& ray, const TriangleBlock* block
         const Sheared<V> seen(sheared,
                               [&](size_t k, uint32_t axis) { return load(k * 3 * kBlockSize + first + axis); });
         const V inwards = depth_inside(seen.side);  // lanes without a triangle are NaN and fail
-        V below = hn::Zero(d);
-        V mz = below;
+        EdgeLimits<V> limit{hn::Zero(d), hn::Zero(d)};
         if constexpr (kExact) {
-            mz = largest_of(seen.z);
-            below = seen.minus_edge_error(sheared.slant, mz);
+            limit = limits(seen);
         }
-        const auto inside = hn::Ge(inwards, below);
-        const V bound = hn::Neg(below);
+        const auto inside = hn::Ge(inwards, limit.minus_error);
+        const V bound = hn::Neg(limit.minus_error);
         const V(&z)[3] = seen.z;
         const DepthRange<V> depth =
-            depth_range<kExact>(seen.side, bound, mz, z[0], hn::Sub(z[1], z[0]), hn::Sub(z[2], z[0]), ray.sign);
+            depth_range<kExact>(seen.side, bound, limit.mz, z[0], hn::Sub(z[1], z[0]), hn::Sub(z[2], z[0]), ray.sign);
         const auto is_certain = kExact ? hn::And(depth.is_sound, hn::Gt(inwards, bound)) : inside;
         const auto counts = hn::And(
             inside, hn::And(hn::Le(depth.lower, hn::Set(d, ray.reach)), hn::Ge(depth.upper, hn::Set(d, ray.start))));
@@ -227,6 +237,17 @@ HWY_INLINE uint32_t test_blocks(const TracedRay& ray, const TriangleBlock* block
         certain |= mask_bits(d, is_certain) << first;
     }
     verdict.certain = certain;
+    return possible;
+}
+
+/// Of a block, and of the one behind it where a step takes two and `second` is 1.
+template <bool kExact>
+HWY_INLINE uint32_t test_blocks(const TracedRay& ray, const TriangleBlock* block, uint32_t second, Verdict& verdict) {
+    const auto limits = [&]<class V>(const Sheared<V>& seen) {
+        const V mz = largest_of(seen.z);
+        return EdgeLimits<V>{seen.minus_edge_error(hn::Set(hn::DFromV<V>(), ray.slant), mz), mz};
+    };
+    const uint32_t possible = test_lanes<kExact>(ray, BlockLoader(block, second), limits, verdict);
     return second == 0 ? possible & ((1U << kBlockSize) - 1) : possible;
 }
 

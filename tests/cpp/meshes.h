@@ -107,4 +107,22 @@ inline Mesh make_grid(uint32_t squares) {
     return mesh;
 }
 
+/// A sphere on a floor, before a wall with two sides, and with a step in the corner: large triangles, which lie in
+/// leaves right below the root, behind and before small ones.
+inline Mesh make_room() {
+    Mesh mesh = make_sphere(24, 32);
+    const auto square = [&](Vec3f corner, Vec3f along, Vec3f across, uint32_t times) {
+        for (uint32_t i = 0; i < times; ++i) {
+            const Vec3f a = corner + along * static_cast<float>(i);
+            mesh.add_triangle(a, a + along, a + across);
+            mesh.add_triangle(a + along, a + along + across, a + across);
+        }
+    };
+    square({-4, -4, -1}, {2, 0, 0}, {0, 8, 0}, 4);
+    square({-4, 4, -1}, {4, 0, 0}, {0, 0, 6}, 2);
+    square({-4, 4.001F, -1}, {4, 0, 0}, {0, 0, 6}, 2);
+    square({3, -4, -0.9F}, {1, 0, 0}, {0, 8, 0}, 1);
+    return mesh;
+}
+
 }  // namespace espalier

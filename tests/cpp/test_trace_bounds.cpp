@@ -38,6 +38,8 @@ struct DepthsResult {
 };
 struct FilterResult {
     float side[3], bound;
+    float mz;
+    float bound_in_tree, mz_in_tree;  ///< no triangle's is larger
     float least_inside;  ///< where a step asks first, what is no further inside is ruled out before its bound is known
     bool possible, certain;
     float lower, upper;
@@ -168,13 +170,18 @@ inline FilterResult filter(const Ray& ray, const Vec3f (&corner)[3], const Box3f
     using V = hn::Vec<decltype(d)>;
     const ShearedRay<V> own = sheared_for_all(d, traced);
     const Sheared<V> seen(own, [&](size_t k, uint32_t axis) { return hn::Load(d, block.vertex[k][0] + axis); });
-    const V bound = hn::Neg(seen.minus_edge_error(own.slant, largest_of(seen.z)));
+    const V mz = largest_of(seen.z);
+    const V bound = hn::Neg(seen.minus_edge_error(own.slant, mz));
+    const RayBatch::AtLeaf at_leaf = batch.at_leaf(lane_of(ray));
     Verdict verdict{};
     constexpr bool kTwo = kBlocksPerStep == 2;
     constexpr uint32_t kLane = kTwo ? kBlockSize : 0;
     const uint32_t possible = test_blocks<true>(traced, blocks + (kTwo ? 0 : 1), kTwo ? 1 : 0, verdict);
     return {{hn::GetLane(seen.side[0]), hn::GetLane(seen.side[1]), hn::GetLane(seen.side[2])},
             hn::GetLane(bound),
+            hn::GetLane(mz),
+            -at_leaf.minus_edge_error,
+            at_leaf.mz,
             batch.least_inside()[size_class],
             (possible >> kLane & 1U) != 0,
             (possible >> kLane & verdict.certain >> kLane & 1U) != 0,
@@ -450,6 +457,7 @@ TEST_P(TraceBounds, OfTheFloatFilterHoldWhatItDoesNotDecide) {
     Random random(5);
     Share edges(named("edge functions, 8"));
     Share outsides(named("bound of a hit by size class, 8"));
+    Share in_tree(named("bound of all triangles in a tree, 8"));
     Share depths(named("depth of a hit, 8"));
     uint32_t lost = 0;
     uint32_t invented = 0;
@@ -466,6 +474,8 @@ TEST_P(TraceBounds, OfTheFloatFilterHoldWhatItDoesNotDecide) {
         const ExactTriangle truth(aimed.ray, aimed.corner);
         const Exact along = aimed.ray.direction[largest_axis(aimed.ray.direction)];
         add_edges(edges, result.side, truth, along, result.bound);
+        in_tree.add(result.bound, result.bound_in_tree);
+        in_tree.add(result.mz, result.mz_in_tree);
         if (truth.is_hit() && GetParam().asks_first) {
             outsides.add(result.bound, -result.least_inside);
         }
@@ -485,6 +495,7 @@ TEST_P(TraceBounds, OfTheFloatFilterHoldWhatItDoesNotDecide) {
     EXPECT_GT(decided, 1000U);
     EXPECT_LT(edges.largest(), 1);
     EXPECT_GT(edges.largest(), 0.1);
+    EXPECT_EQ(in_tree.largest(), 1) << "where nothing but what underflow may take counts, or one corner is the tree's";
     EXPECT_LT(outsides.largest(), 1);
     EXPECT_EQ(outsides.largest() > 0.1, GetParam().asks_first);
     EXPECT_LT(depths.largest(), 1);

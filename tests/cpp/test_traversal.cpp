@@ -83,7 +83,8 @@ TEST(Traversal, LosesNoHit) {
     for (float& x : far.positions) {
         x += 1e5F;
     }
-    const Mesh meshes[] = {make_sphere(24, 32), make_soup(1500, 11), make_furball(300), make_grid(20), far};
+    const Mesh meshes[] = {make_sphere(24, 32), make_soup(1500, 11), make_furball(300),
+                           make_grid(20),       make_room(),         far};
     for (const Mesh& mesh : meshes) {
         const Tree list = make_flat_list(mesh);
         const std::vector<Ray> rays = make_rays(mesh, 3000, 12);
@@ -206,7 +207,8 @@ TEST(Traversal, IsTheSameInAnyBatch) {
     for (float& x : far.positions) {
         x += 1e4F;
     }
-    const Mesh meshes[] = {make_sphere(24, 32), make_soup(1500, 11), make_furball(300), make_grid(20), far};
+    const Mesh meshes[] = {make_sphere(24, 32), make_soup(1500, 11), make_furball(300),
+                           make_grid(20),       make_room(),         far};
     for (const Mesh& mesh : meshes) {
         const Tree tree = build(mesh.soup(), {});
         const Tree list = make_flat_list(mesh);
