@@ -21,6 +21,40 @@ inline void set_box(WideNode& node, size_t slot, const Box3f& box) {
     }
 }
 
+/// Where any hit will do, what is looked through soonest comes first (as Nah and Manocha 2014 take the largest surface
+/// first): a leaf by its blocks, and behind all leaves a wide node by how many it and those below it are. Unused places
+/// cost most.
+class ChildCosts {
+ public:
+    ChildCosts() {
+        for (size_t slot = 0; slot < WideNode::kWidth; ++slot) {
+            keys_[slot] = INT32_MAX - static_cast<int32_t>(slot);
+        }
+    }
+
+    void set_leaf(size_t slot, uint32_t blocks) { set(slot, blocks); }
+    void set_nodes(size_t slot, uint32_t count) { set(slot, WideNode::kMaxLeafBlocks + count); }
+
+    /// Adds the order to a node that has its orders by octant.
+    void write(WideNode& node) const {
+        std::array<int32_t, WideNode::kWidth> ranks{};
+        for (size_t other = 0; other < WideNode::kWidth; ++other) {
+            for (size_t slot = 0; slot < WideNode::kWidth; ++slot) {  // a vector operation, as the compiler does it
+                ranks[slot] += keys_[other] > keys_[slot] ? 1 : 0;
+            }
+        }
+        for (size_t slot = 0; slot < WideNode::kWidth; ++slot) {
+            node.order[ranks[slot]] |= static_cast<uint32_t>(slot) << WideNode::kSoonestShift;
+        }
+    }
+
+ private:
+    /// No two are equal. There are fewer than 2^27 wide nodes, of 256 bytes each.
+    void set(size_t slot, uint32_t cost) { keys_[slot] = static_cast<int32_t>(cost << 3 | slot); }
+
+    std::array<int32_t, WideNode::kWidth> keys_;
+};
+
 /// In which order rays of each octant meet the children of a wide node, while it opens from one to eight of them.
 class ChildOrder {
  public:

@@ -283,6 +283,7 @@ class Collapse::Writer {
     struct Row {
         WideNode& wide;
         ChildOrder order;
+        ChildCosts costs;
         size_t count = 1;
         struct Below {
             size_t slot;
@@ -307,6 +308,7 @@ class Collapse::Writer {
 
     uint32_t finish(Row& row) {
         row.order.write(row.count, row.wide);
+        row.costs.write(row.wide);
         const uint32_t place = next_++;
         for (const Row::Below& below : std::span(row.below).first(row.below_count)) {
             uint32_t& child = row.wide.child[below.slot];
@@ -334,6 +336,7 @@ class Collapse::Writer {
             left_places == 0 ? take(row, leaf, slot) : open(row, leaf, slot, places, left_places);
         } else if (left_places == 0) {
             set_box(row.wide, slot, piece_->box(node));
+            row.costs.set_nodes(slot, collapse_.wide_nodes(node));
             row.below[row.below_count++] = {slot, node, {}};
         } else {
             open(row, kd, node, slot, places, left_places);
@@ -372,8 +375,10 @@ class Collapse::Writer {
     void take(Row& row, const LeafPart& leaf, size_t slot) {
         set_box(row.wide, slot, leaf.box);
         if (leaf.is_long()) {
+            row.costs.set_nodes(slot, leaf.blocks / WideNode::kMaxLeafBlocks);
             row.below[row.below_count++] = {slot, 0, leaf};
         } else {
+            row.costs.set_leaf(slot, leaf.blocks);
             // Only a subtree that has lost all it had is a leaf of nothing, and no ray meets its box.
             row.wide.child[slot] =
                 leaf.blocks == 0 ? WideNode::leaf(0, 1) : WideNode::leaf(leaf.first_block + first_block_, leaf.blocks);

@@ -73,8 +73,11 @@ struct alignas(64) WideNode {
     float lower[3][kWidth];  ///< unused lanes hold an inverted box, which no ray meets
     float upper[3][kWidth];
     uint32_t child[kWidth];  ///< index of a wide node, leaf(first_block, blocks), or unopened(number)
-    uint32_t order[8];  ///< per ray octant (bit a: direction[a] < 0): eight ranks of 3 bits, the nearest child in the
-                        ///< highest
+    /// Per ray octant (bit a: direction[a] < 0) eight ranks of 3 bits, the nearest child in the highest. In the highest
+    /// byte of all together one more order, the same for every octant: of how soon a child is looked through, the
+    /// soonest in the last. Nodes above what is built on demand have none such.
+    uint32_t order[8];
+    static constexpr uint32_t kSoonestShift = 24;
 
     static constexpr uint32_t leaf(uint32_t first_block, uint32_t blocks) {
         return kLeafFlag | (first_block << 5) | (blocks - 1);

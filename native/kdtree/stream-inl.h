@@ -77,7 +77,6 @@ struct StreamRay : TracedRay {
         std::copy_n(below.children + overflow, count, children + 1);
         std::copy_n(below.depths + overflow, count, depths + 1);
         top = children + 1 + count;
-        prune();
     }
 
     /// Drops what lies beyond the ray's reach.
@@ -99,28 +98,49 @@ struct StreamRay : TracedRay {
     }
 };
 
-/// Stacks the children that the ray enters, nearer ones later.
+/// In which order a ray looks at a node's children.
+enum class Order { kNearest, kSoonest };
+
+/// Stacks the children that the ray enters, and those to be looked at first last. With how far away they are, where
+/// the nearest counts: only there does a ray's reach become shorter.
+template <Order kOrder, bool kDepths>
 HWY_INLINE void stack_children(StreamRay& ray, const WideNode& node, const ChildEntries& entries) {
-    uint32_t order = node.order[ray.octant];
 #if HWY_TARGET != HWY_SSE4 && HWY_TARGET != HWY_NEON
-    // Permuted by the octant's order and compressed onto the stack, without a branch on their number.
+    // Permuted into that order and compressed onto the stack, without a branch on their number.
     const hn::CappedTag<float, WideNode::kWidth> d;
     const hn::RebindToUnsigned<decltype(d)> du;
-    const auto ranks = hn::Shr(hn::Set(du, order), hn::Mul(hn::Iota(du, 0), hn::Set(du, 3)));
-    const auto slots = hn::IndicesFromVec(d, hn::And(ranks, hn::Set(du, 7)));
+    auto ranks = hn::Zero(du);
+    if constexpr (kOrder == Order::kSoonest) {
+        ranks = hn::ShiftRight<WideNode::kSoonestShift>(hn::Load(du, node.order));
+    } else {
+        const auto all = hn::Set(du, node.order[ray.octant]);
+        ranks = hn::And(hn::Shr(all, hn::Mul(hn::Iota(du, 0), hn::Set(du, 3))), hn::Set(du, 7));
+    }
+    const auto slots = hn::IndicesFromVec(d, ranks);
     const auto child = hn::BitCast(du, hn::TableLookupLanes(hn::BitCast(d, hn::Load(du, node.child)), slots));
     const auto depth = hn::TableLookupLanes(entries.depth, slots);
-    ray.top += compress_pair(d, hn::Lt(depth, hn::Inf(d)), child, ray.top, depth, ray.top_depth());
+    const auto is_met = hn::Lt(depth, hn::Inf(d));
+    if constexpr (kDepths) {
+        ray.top += compress_pair(d, is_met, child, ray.top, depth, ray.top_depth());
+    } else {
+        const Compression compression(d, is_met);
+        compression.store(du, child, ray.top);
+        ray.top += std::popcount(compression.bits());
+    }
 #else
-    for (int i = 0; i < WideNode::kWidth; ++i, order >>= 3) {
-        const uint32_t slot = order & 7U;
+    uint32_t near = node.order[ray.octant];
+    for (int i = 0; i < WideNode::kWidth; ++i, near >>= 3) {
+        const uint32_t slot = kOrder == Order::kSoonest ? node.order[i] >> WideNode::kSoonestShift : near & 7U;
         *ray.top = node.child[slot];
-        *ray.top_depth() = entries.depth[slot];
+        if constexpr (kDepths) {
+            *ray.top_depth() = entries.depth[slot];
+        }
         ray.top += entries.met >> slot & 1U;
     }
 #endif
 }
 
+template <Order kOrder, bool kDepths>
 HWY_INLINE void visit_node(StreamRay& ray, const WideNode& node) {
     const hn::CappedTag<float, WideNode::kWidth> d;
     constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<float, WideNode::kWidth>());
@@ -142,7 +162,7 @@ HWY_INLINE void visit_node(StreamRay& ray, const WideNode& node) {
         entries.met |= mask_bits(d, span.meets()) << first;
 #endif
     }
-    stack_children(ray, node, entries);
+    stack_children<kOrder, kDepths>(ray, node, entries);
 }
 
 /// Traces rays through a tree. For any hit a ray ends at the first.
@@ -177,7 +197,7 @@ class Stream {
                 if (ray.is_full()) [[unlikely]] {
                     ray.spill(overflow_[&ray - ray_]);
                 }
-                visit_node(ray, nodes_[ray.next]);
+                in_order([&]<Order kOrder>() { visit_node<kOrder, !kAnyHit>(ray, nodes_[ray.next]); });
             }
             // In a loop of its own: what a node has put on a stack is long in coming, and while one ray waited for it,
             // a processor could look ahead to no more than a few others.
@@ -230,6 +250,9 @@ class Stream {
                 StreamRay& ray = *end_list_[i];
                 if (ray.overflow != 0) [[unlikely]] {
                     ray.refill(overflow_[&ray - ray_]);
+                    if constexpr (!kAnyHit) {
+                        ray.prune();
+                    }
                     list(ray, *--ray.top, lists);
                     continue;
                 }
@@ -266,6 +289,17 @@ class Stream {
         uint32_t possible;
     };
 
+    /// Calls f<order>() for the order in which rays look at children. On demand the nearest come first, where others
+    /// have been: what costs most there is to open what none has seen.
+    template <class F>
+    HWY_INLINE void in_order(const F& f) const {
+        if (kAnyHit && on_demand_ == nullptr) {
+            f.template operator()<Order::kSoonest>();
+        } else {
+            f.template operator()<Order::kNearest>();
+        }
+    }
+
     /// Puts the next ray, if there is one, in place of one that has ended.
     template <class Done>
     HWY_INLINE void begin(StreamRay& ray, Lists& lists, const Done& done) {
@@ -277,7 +311,7 @@ class Stream {
         batch_.copy(lane, ray);
         ray.number = first_ + lane;
         ray.clear_stack();
-        stack_children(ray, nodes_[0], batch_.root_entries(lane));
+        in_order([&]<Order kOrder>() { stack_children<kOrder, !kAnyHit>(ray, nodes_[0], batch_.root_entries(lane)); });
         // Not fetched: with as many rays going there, it is at hand.
         list(ray, *--ray.top, lists);
     }

@@ -275,6 +275,42 @@ TEST(Collapse, IsTheSameWhereTheTreeIsFarLargerThanAllBelow) {
     EXPECT_EQ(children(0x1p75F), children(1));
 }
 
+/// What it takes to look through a child of a wide node: of leaves their blocks, of nodes how many there are.
+uint32_t cost_of_child(const std::vector<WideNode>& wide, const WideNode& node, uint32_t slot) {
+    if (node.lower[0][slot] > node.upper[0][slot]) {
+        return UINT32_MAX;  // there is none
+    }
+    const std::function<uint32_t(uint32_t)> count = [&](uint32_t index) {
+        uint32_t nodes = 1;
+        for (const uint32_t child : wide.at(index).child) {
+            nodes += (child & WideNode::kLeafFlag) == 0 ? count(child) : 0;
+        }
+        return nodes;
+    };
+    const uint32_t child = node.child[slot];
+    return (child & WideNode::kLeafFlag) != 0 ? WideNode::blocks(child) : WideNode::kMaxLeafBlocks + count(child);
+}
+
+TEST(Collapse, OrdersChildrenByHowSoonTheyAreLookedThrough) {
+    for (unsigned seed = 0; seed < 20; ++seed) {
+        RandomTree tree(seed, 1 + 15 * seed, 6);
+        const std::vector<WideNode> wide = written_at_once(tree);
+        for (const WideNode& node : wide) {
+            uint32_t before = UINT32_MAX;
+            uint32_t slots = 0;
+            for (const uint32_t word : node.order) {
+                const uint32_t slot = word >> WideNode::kSoonestShift;
+                ASSERT_LT(slot, static_cast<uint32_t>(WideNode::kWidth));
+                slots |= 1U << slot;
+                const uint32_t cost = cost_of_child(wide, node, slot);
+                EXPECT_LE(cost, before) << "seed " << seed;
+                before = cost;
+            }
+            EXPECT_EQ(slots, 0xffU) << "each child has its place in the order";
+        }
+    }
+}
+
 TEST(Collapse, GivesNoPlaceToWhatHasLostAllItHad) {
     std::vector<KdNode> nodes{KdNode::inner(0, 0, 2), KdNode::leaf(0, kBlockSize)};
     const std::function<void(int)> add_nothing = [&](int levels) {

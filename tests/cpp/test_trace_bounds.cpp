@@ -116,8 +116,8 @@ inline DepthsResult depths_of(const Ray& ray, float extent, const Box3f& box) {
         batch.copy(lane, *stream_ray);
         stream_ray->clear_stack();
     }
-    stack_children(at_root, root, entries);
-    visit_node(at_node, root);
+    stack_children<Order::kNearest, true>(at_root, root, entries);
+    visit_node<Order::kNearest, true>(at_node, root);
     const auto count = at_root.top - at_root.children;
     result.is_like_a_node = at_node.top - at_node.children == count &&
                             std::equal(at_root.children, at_root.top, at_node.children) &&

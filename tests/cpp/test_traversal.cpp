@@ -56,7 +56,9 @@ Tree make_flat_list(const Mesh& mesh, uint32_t longest_leaf = WideNode::kMaxLeaf
             }
             first += blocks;
         }
-        std::fill(node.order, node.order + 8, 076543210U);
+        for (uint32_t i = 0; i < WideNode::kWidth; ++i) {
+            node.order[i] = 076543210U | i << WideNode::kSoonestShift;
+        }
     }
     return tree;
 }
