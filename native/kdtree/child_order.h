@@ -22,8 +22,8 @@ inline void set_box(WideNode& node, size_t slot, const Box3f& box) {
 }
 
 /// Where any hit will do, what is looked through soonest comes first (as Nah and Manocha 2014 take the largest surface
-/// first): a leaf by its blocks, and behind all leaves a wide node by how many it and those below it are. Unused places
-/// cost most.
+/// first): a leaf by its blocks, and behind all leaves a wide node by how many it and those below it are. Places that
+/// are not used cost most.
 class ChildCosts {
  public:
     ChildCosts() {
@@ -49,7 +49,8 @@ class ChildCosts {
     }
 
  private:
-    /// No two are equal. There are fewer than 2^27 wide nodes, of 256 bytes each.
+    /// No two are equal. There are fewer wide nodes than the 2^26 blocks that leaves can count: but for a root alone,
+    /// each has two children or more.
     void set(size_t slot, uint32_t cost) { keys_[slot] = static_cast<int32_t>(cost << 3 | slot); }
 
     std::array<int32_t, WideNode::kWidth> keys_;

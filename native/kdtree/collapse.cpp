@@ -375,7 +375,7 @@ class Collapse::Writer {
     void take(Row& row, const LeafPart& leaf, size_t slot) {
         set_box(row.wide, slot, leaf.box);
         if (leaf.is_long()) {
-            row.costs.set_nodes(slot, leaf.blocks / WideNode::kMaxLeafBlocks);
+            row.costs.set_nodes(slot, plan_of(leaf).wide_nodes);
             row.below[row.below_count++] = {slot, 0, leaf};
         } else {
             row.costs.set_leaf(slot, leaf.blocks);

@@ -237,12 +237,18 @@ class RayBatch {
     /// Has a ray pass a child of the root by.
     void pass_by(size_t lane, uint32_t child) { entries_[child / 4][4 * lane + child % 4] = kInfinity; }
 
-    /// Takes in that a ray hits something, at a depth between these two.
+    /// Takes in that a ray hits something, at a depth between these two, which has it pass by what lies beyond.
     HWY_INLINE void shorten(size_t lane, uint32_t place, float lower, float upper) {
-        quads_[1][4 * lane + 3] = reach_behind(upper);
+        const hn::CappedTag<float, 4> d;
+        const float reach = reach_behind(upper);
+        quads_[1][4 * lane + 3] = reach;
         quads_[7][4 * lane + 2] = lower;
         quads_[7][4 * lane + 3] = upper;
         place_[lane] = place;
+        for (auto& half : entries_) {
+            const auto entry = hn::Load(d, half + 4 * lane);
+            hn::Store(hn::IfThenElse(hn::Le(entry, hn::Set(d, reach)), entry, hn::Inf(d)), d, half + 4 * lane);
+        }
     }
 
     HWY_INLINE ChildEntries root_entries(size_t lane) const {

@@ -14,6 +14,7 @@
 #include <algorithm>
 #include <bit>
 #include <cstdint>
+#include <iterator>
 #include <limits>
 
 #include "kdtree/node.h"
@@ -31,12 +32,8 @@ class RootLeaves {
         for (size_t child = 0; child < WideNode::kWidth; ++child) {
             const uint32_t code = root.child[child];
             const bool is_leaf = (code & WideNode::kLeafFlag) != 0 && !WideNode::is_unopened(code);
-            if (is_leaf && WideNode::blocks(code) <= kMostBlocks) {
-                leaves_ |= 1U << child;
-                if constexpr (kBlocksPerStep == kMostBlocks) {
-                    lay_out(code, corners_[child]);
-                }
-            }
+            const bool is_used = root.lower[0][child] <= root.upper[0][child];
+            leaves_ |= is_leaf && is_used && WideNode::blocks(code) <= kMostBlocks ? 1U << child : 0U;
         }
     }
 
@@ -46,6 +43,9 @@ class RootLeaves {
     template <class Done>
     HWY_INLINE uint32_t visit(RayBatch& batch, uint32_t rays, const Done& done) {
         const uint32_t at_leaf = leaves_ != 0 ? batch.first_in(leaves_) & rays : 0;
+        if (kAtOnce && at_leaf != 0 && !is_laid_out_) [[unlikely]] {
+            lay_out();
+        }
         // Two loops: whether a ray ends is known late, and a wrong guess would hold up the tests of others.
         for (uint32_t rest = at_leaf; rest != 0; rest &= rest - 1) {
             test(batch, static_cast<uint32_t>(std::countr_zero(rest)));
@@ -59,6 +59,9 @@ class RootLeaves {
 
  private:
     static constexpr uint32_t kMostBlocks = 2;
+    static constexpr bool kAtOnce = kBlocksPerStep == kMostBlocks;  ///< a step tests all that a leaf has
+
+    static constexpr size_t kRows = 9;  ///< three coordinates of three corners
 
     /// What a ray's test has found.
     struct Meeting {
@@ -68,14 +71,20 @@ class RootLeaves {
         uint32_t has_more;  ///< 1 where there is another block with triangles to be tested
     };
 
-    /// Corners of two blocks side by side, or NaN for a second that a leaf does not have.
-    void lay_out(uint32_t leaf, float* corners) const {
-        const TriangleBlock* block = blocks_ + WideNode::first_block(leaf);
-        std::fill_n(corners, 9 * kMostBlocks * kBlockSize, std::numeric_limits<float>::quiet_NaN());
-        for (size_t b = 0; b < WideNode::blocks(leaf); ++b) {
-            for (size_t row = 0; row < 9; ++row) {
-                std::copy_n(block[b].vertex[0][0] + row * kBlockSize, kBlockSize,
-                            corners + (row * kMostBlocks + b) * kBlockSize);
+    /// Copies the corners of each leaf's blocks side by side, NaN for a second that it does not have. Not before a ray
+    /// gets to one: many calls are of few rays, or of packets.
+    HWY_NOINLINE void lay_out() {
+        is_laid_out_ = true;
+        for (uint32_t rest = leaves_; rest != 0; rest &= rest - 1) {
+            const auto child = static_cast<size_t>(std::countr_zero(rest));
+            const uint32_t leaf = root_.child[child];
+            const TriangleBlock* block = blocks_ + WideNode::first_block(leaf);
+            std::fill(std::begin(corners_[child]), std::end(corners_[child]), std::numeric_limits<float>::quiet_NaN());
+            for (size_t b = 0; b < WideNode::blocks(leaf); ++b) {
+                for (size_t row = 0; row < kRows; ++row) {
+                    std::copy_n(block[b].vertex[0][0] + row * kBlockSize, kBlockSize,
+                                corners_[child] + (row * kMostBlocks + b) * kBlockSize);
+                }
             }
         }
     }
@@ -91,13 +100,14 @@ class RootLeaves {
             const hn::DFromV<V> d;
             return EdgeLimits<V>{hn::Set(d, ray.minus_edge_error), hn::Set(d, ray.mz)};
         };
-        if constexpr (kBlocksPerStep == kMostBlocks) {
+        if constexpr (kAtOnce) {
             const float* corners = corners_[batch.first_child(lane)];
             const auto load = [&](size_t from) {
                 return hn::Load(hn::CappedTag<float, kBlocksPerStep * kBlockSize>(), corners + kBlocksPerStep * from);
             };
             met.possible = test_lanes<kExact>(ray, load, limits, met.verdict);
         } else {
+            static_assert(kMostBlocks == 2);
             const auto is_asked = [&](uint32_t block) {
                 return at_most_one(lanes_in_question<kExact>(ray, blocks_[block], batch.least_inside()));
             };
@@ -119,8 +129,9 @@ class RootLeaves {
         const uint32_t child = batch.first_child(lane);
         const auto others = [&](float reach) { return batch.entered(lane, reach) & ~(1U << child); };
         if (met.possible == 0) {
-            batch.pass_by(lane, child);
-            return 1 - at_most_one(others(kInfinity));
+            const uint32_t goes_on = at_most_one(others(kInfinity));
+            batch.pass_by(lane, child);  // not before: what is read behind a part of it that was written has to wait
+            return 1 - goes_on;
         }
         const auto hit = static_cast<uint32_t>(std::countr_zero(met.possible));
         const float lower = met.verdict.lower[hit];
@@ -132,8 +143,8 @@ class RootLeaves {
         }
         const uint32_t place = met.block * kBlockSize + hit;
         if (!kAnyHit && others(reach_behind(upper)) != 0) {
-            batch.pass_by(lane, child);
             batch.shorten(lane, place, lower, upper);
+            batch.pass_by(lane, child);
             return 0;
         }
         done(lane, place);
@@ -143,7 +154,8 @@ class RootLeaves {
     const WideNode& root_;
     const TriangleBlock* blocks_;
     uint32_t leaves_ = 0;  ///< those children of the root that are leaves of few blocks, a bit for each
-    alignas(64) float corners_[kBlocksPerStep == kMostBlocks ? WideNode::kWidth : 1][9 * kMostBlocks * kBlockSize];
+    bool is_laid_out_ = false;
+    alignas(64) float corners_[kAtOnce ? WideNode::kWidth : 1][kRows * kMostBlocks * kBlockSize];
     Meeting meetings_[RayBatch::kSize];
 };
 

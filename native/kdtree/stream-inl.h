@@ -36,7 +36,7 @@ struct Overflow {
     float depths[kCapacity];
 };
 
-/// A ray under way with what it still has to visit, the nearest on top, and at the bottom the mark that nothing is
+/// A ray under way with what it still has to visit, what comes first on top, and at the bottom the mark that nothing is
 /// left. Small, since all rays in flight are in use at once: together they are to lie on few pages.
 struct StreamRay : TracedRay {
     static constexpr uint32_t kNothing = 0;  ///< the root, which is nobody's child
@@ -48,7 +48,7 @@ struct StreamRay : TracedRay {
     uint32_t overflow;  ///< how many wait in its Overflow
     uint32_t* top;
     uint32_t children[kCapacity];
-    float depths[kCapacity];  ///< where the ray enters the child
+    float depths[kCapacity];  ///< where the ray enters the child, if the nearest hit is looked for
 
     HWY_INLINE float* top_depth() { return depths + (top - children); }
 
@@ -62,21 +62,28 @@ struct StreamRay : TracedRay {
     HWY_INLINE bool is_full() const { return top > children + kFull; }
 
     /// Moves all but the mark there.
+    template <bool kDepths>
     HWY_NOINLINE void spill(Overflow& below) {
         const auto count = static_cast<size_t>(top - children) - 1;
         std::copy_n(children + 1, count, below.children + overflow);
-        std::copy_n(depths + 1, count, below.depths + overflow);
+        if constexpr (kDepths) {
+            std::copy_n(depths + 1, count, below.depths + overflow);
+        }
         overflow += static_cast<uint32_t>(count);
         top = children + 1;
     }
 
-    /// Takes the nearest from there, of which there are some, onto an empty stack whose mark was taken off.
+    /// Takes what comes first from there, where there is something, onto an empty stack whose mark was taken off.
+    template <bool kDepths>
     HWY_NOINLINE void refill(const Overflow& below) {
         const uint32_t count = std::min<uint32_t>(overflow, kFull / 2);
         overflow -= count;
         std::copy_n(below.children + overflow, count, children + 1);
-        std::copy_n(below.depths + overflow, count, depths + 1);
         top = children + 1 + count;
+        if constexpr (kDepths) {
+            std::copy_n(below.depths + overflow, count, depths + 1);
+            prune();
+        }
     }
 
     /// Drops what lies beyond the ray's reach.
@@ -195,7 +202,7 @@ class Stream {
             for (uint32_t i = 0; i < nodes; ++i) {
                 StreamRay& ray = *node_list_[i];
                 if (ray.is_full()) [[unlikely]] {
-                    ray.spill(overflow_[&ray - ray_]);
+                    ray.template spill<!kAnyHit>(overflow_[&ray - ray_]);
                 }
                 in_order([&]<Order kOrder>() { visit_node<kOrder, !kAnyHit>(ray, nodes_[ray.next]); });
             }
@@ -249,10 +256,7 @@ class Stream {
             for (uint32_t i = 0; i < ended; ++i) {
                 StreamRay& ray = *end_list_[i];
                 if (ray.overflow != 0) [[unlikely]] {
-                    ray.refill(overflow_[&ray - ray_]);
-                    if constexpr (!kAnyHit) {
-                        ray.prune();
-                    }
+                    ray.template refill<!kAnyHit>(overflow_[&ray - ray_]);
                     list(ray, *--ray.top, lists);
                     continue;
                 }

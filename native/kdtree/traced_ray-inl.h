@@ -107,7 +107,7 @@ inline float extent_of(const Box3f& bounds) {
 HWY_INLINE float reach_behind(float upper) { return upper * (1 + 0x1p-20F) + kTiny; }
 
 /// Distances are depths: measured along the direction's largest component, z, so depth = t |direction[z]|. They neither
-/// overflow nor underflow where t would. RayBatch fills rays in, four words at a time.
+/// overflow nor underflow where t would. RayBatch fills rays in, four words at a time, but for the last.
 struct alignas(16) TracedRay {
     // Box test: a plane's depth is plane * inverse + shift, see Slab.
     float inverse[3];

@@ -192,7 +192,7 @@ HWY_INLINE uint32_t lanes_in_question(const SomeRay& ray, const TriangleBlock& b
 /// Of triangles as Sheared has them, what their errors are found by.
 template <class V>
 struct EdgeLimits {
-    V minus_error;  ///< no edge function is off by more
+    V minus_error;  ///< no edge function is off by more than minus this
     V mz;           ///< no corner's |z| is larger
 };
 

@@ -108,7 +108,8 @@ inline Mesh make_grid(uint32_t squares) {
 }
 
 /// A sphere on a floor, before a wall with two sides, and with a step in the corner: large triangles, which lie in
-/// leaves right below the root, behind and before small ones.
+/// leaves right below the root, behind and before small ones. On the floor and in its plane lie fine sheets, one that
+/// comes before it and one behind.
 inline Mesh make_room() {
     Mesh mesh = make_sphere(24, 32);
     const auto square = [&](Vec3f corner, Vec3f along, Vec3f across, uint32_t times) {
@@ -118,10 +119,17 @@ inline Mesh make_room() {
             mesh.add_triangle(a + along, a + along + across, a + across);
         }
     };
+    const auto sheet = [&](Vec3f corner) {
+        for (uint32_t row = 0; row < 16; ++row) {
+            square(corner + Vec3f{0, 0.0625F * static_cast<float>(row), 0}, {0.0625F, 0, 0}, {0, 0.0625F, 0}, 16);
+        }
+    };
+    sheet({-3, -3, -1});
     square({-4, -4, -1}, {2, 0, 0}, {0, 8, 0}, 4);
     square({-4, 4, -1}, {4, 0, 0}, {0, 0, 6}, 2);
     square({-4, 4.001F, -1}, {4, 0, 0}, {0, 0, 6}, 2);
     square({3, -4, -0.9F}, {1, 0, 0}, {0, 8, 0}, 1);
+    sheet({1, -3, -1});
     return mesh;
 }
 
