@@ -60,8 +60,7 @@ class RootLeaves {
  private:
     static constexpr uint32_t kMostBlocks = 2;
     static constexpr bool kAtOnce = kBlocksPerStep == kMostBlocks;  ///< a step tests all that a leaf has
-
-    static constexpr size_t kRows = 9;  ///< three coordinates of three corners
+    static constexpr size_t kRows = 9;                              ///< three coordinates of three corners
 
     /// What a ray's test has found.
     struct Meeting {
@@ -109,7 +108,7 @@ class RootLeaves {
         } else {
             static_assert(kMostBlocks == 2);
             const auto is_asked = [&](uint32_t block) {
-                return at_most_one(lanes_in_question<kExact>(ray, blocks_[block], batch.least_inside()));
+                return at_most_one(lanes_in_question<kExact>(ray, blocks_[block], ray.minus_edge_error));
             };
             const uint32_t first = is_asked(met.block);
             const uint32_t second = is_asked(met.block + further) & further;

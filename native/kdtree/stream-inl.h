@@ -204,7 +204,7 @@ class Stream {
                 if (ray.is_full()) [[unlikely]] {
                     ray.template spill<!kAnyHit>(overflow_[&ray - ray_]);
                 }
-                in_order([&]<Order kOrder>() { visit_node<kOrder, !kAnyHit>(ray, nodes_[ray.next]); });
+                in_order([&]<Order kOrder> { visit_node<kOrder, !kAnyHit>(ray, nodes_[ray.next]); });
             }
             // In a loop of its own: what a node has put on a stack is long in coming, and while one ray waited for it,
             // a processor could look ahead to no more than a few others.
@@ -315,7 +315,7 @@ class Stream {
         batch_.copy(lane, ray);
         ray.number = first_ + lane;
         ray.clear_stack();
-        in_order([&]<Order kOrder>() { stack_children<kOrder, !kAnyHit>(ray, nodes_[0], batch_.root_entries(lane)); });
+        in_order([&]<Order kOrder> { stack_children<kOrder, !kAnyHit>(ray, nodes_[0], batch_.root_entries(lane)); });
         // Not fetched: with as many rays going there, it is at hand.
         list(ray, *--ray.top, lists);
     }
@@ -356,8 +356,9 @@ class Stream {
             const uint32_t leaf = ray.next;
             uint32_t meets = 1;
             if (!WideNode::is_unopened(leaf)) [[likely]] {
-                meets = at_most_one(
-                    lanes_in_question<kExact>(ray, blocks_[WideNode::first_block(leaf)], batch_.least_inside()));
+                const TriangleBlock& block = blocks_[WideNode::first_block(leaf)];
+                const float least_inside = batch_.least_inside()[block.triangle[0] / kMaxTriangles];
+                meets = at_most_one(lanes_in_question<kExact>(ray, block, least_inside));
             }
             asked_list_[left] = &ray;
             passing_list_[passing] = &ray;

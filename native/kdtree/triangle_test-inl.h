@@ -169,22 +169,21 @@ HWY_INLINE DepthRange<V> depth_range(const V (&side)[3], V bound, V mz, V z0, V 
             hn::IfThenElse(is_sound, hn::Add(depth, error), hn::Set(d, kInfinity)), is_sound};
 }
 
-/// The lanes of a block that the ray may hit, by whatever depth, and others that come near; least_inside_of_class: as
-/// RayBatch has it.
+/// The lanes of a block that the ray may hit, by whatever depth, and others that come near; least_inside: no edge
+/// function of a triangle that it hits is less inside.
 template <bool kExact, class SomeRay>
-HWY_INLINE uint32_t lanes_in_question(const SomeRay& ray, const TriangleBlock& block,
-                                      const float* least_inside_of_class) {
+HWY_INLINE uint32_t lanes_in_question(const SomeRay& ray, const TriangleBlock& block, float least_inside) {
     const hn::CappedTag<float, kBlockSize> d;
     constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<float, kBlockSize>());
     using V = hn::Vec<decltype(d)>;
     const ShearedRay<V> sheared = sheared_for_all(d, ray);
-    const V least_inside = kExact ? hn::Set(d, least_inside_of_class[block.triangle[0] / kMaxTriangles]) : hn::Zero(d);
+    const V least = hn::Set(d, kExact ? least_inside : 0);
     uint32_t lanes = 0;
     for (size_t first = 0; first < kBlockSize; first += kLanes) {
         const Sheared<V> seen(sheared,
                               [&](size_t k, uint32_t axis) { return hn::Load(d, block.vertex[k][0] + first + axis); });
         // Lanes without a triangle are NaN and fail.
-        lanes |= mask_bits(d, hn::Ge(depth_inside(seen.side), least_inside)) << first;
+        lanes |= mask_bits(d, hn::Ge(depth_inside(seen.side), least)) << first;
     }
     return lanes;
 }
