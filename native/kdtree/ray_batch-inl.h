@@ -13,6 +13,7 @@
 
 #include <algorithm>
 #include <bit>
+#include <cstddef>
 #include <cstdint>
 #include <limits>
 
@@ -186,27 +187,28 @@ class RayBatch {
     };
 
     HWY_INLINE AtLeaf at_leaf(size_t lane) const {
-        const auto number = [&](size_t quad, size_t i) { return quads_[quad][4 * lane + i]; };
-        const auto offset = [&](size_t i) { return std::bit_cast<uint32_t>(number(5, i)); };
-        return {offset(0),
-                offset(1),
-                offset(2),
-                number(6, 0),
-                number(6, 1),
-                number(6, 2),
-                number(5, 3),
-                number(6, 3),
-                number(4, 3),
-                number(3, 3),
-                number(0, 3),
-                number(1, 3),
+        const auto get = [&](size_t offset) { return number(lane, offset); };
+        const auto column = [&](size_t offset) { return std::bit_cast<uint32_t>(number(lane, offset)); };
+        return {column(offsetof(TracedRay, x)),
+                column(offsetof(TracedRay, y)),
+                column(offsetof(TracedRay, z)),
+                get(offsetof(TracedRay, minus_ox)),
+                get(offsetof(TracedRay, minus_oy)),
+                get(offsetof(TracedRay, minus_oz)),
+                get(offsetof(TracedRay, sx)),
+                get(offsetof(TracedRay, sy)),
+                get(offsetof(TracedRay, slant)),
+                get(offsetof(TracedRay, sign)),
+                get(offsetof(TracedRay, start)),
+                get(offsetof(TracedRay, reach)),
                 minus_edge_error_[lane],
                 mz_[lane]};
     }
 
     /// Whether a depth between these two lies within the ray's limits for certain.
     HWY_INLINE bool is_within(size_t lane, float lower, float upper) const {
-        return lower >= quads_[7][4 * lane] && upper <= quads_[7][4 * lane + 1];
+        return lower >= number(lane, offsetof(TracedRay, sure_start)) &&
+               upper <= number(lane, offsetof(TracedRay, sure_end));
     }
 
     /// The child of the root that a ray enters first, of one that enters some.
@@ -241,9 +243,9 @@ class RayBatch {
     HWY_INLINE void shorten(size_t lane, uint32_t place, float lower, float upper) {
         const hn::CappedTag<float, 4> d;
         const float reach = reach_behind(upper);
-        quads_[1][4 * lane + 3] = reach;
-        quads_[7][4 * lane + 2] = lower;
-        quads_[7][4 * lane + 3] = upper;
+        number(lane, offsetof(TracedRay, reach)) = reach;
+        number(lane, offsetof(TracedRay, lower)) = lower;
+        number(lane, offsetof(TracedRay, upper)) = upper;
         place_[lane] = place;
         for (auto& half : entries_) {
             const auto entry = hn::Load(d, half + 4 * lane);
@@ -261,17 +263,25 @@ class RayBatch {
         ChildEntries entries;
         hn::Store(first, d, entries.depth);
         hn::Store(others, d, entries.depth + 4);
-        const auto met = [&](auto depth) { return static_cast<uint32_t>(mask_bits(d, hn::Lt(depth, hn::Inf(d)))); };
-        entries.met = met(first) | met(others) << 4;
+        entries.met = entered(lane, kInfinity);
         return entries;
 #endif
     }
 
  private:
     static constexpr size_t kQuads = 8;
+    static constexpr size_t kQuadBytes = 4 * sizeof(float);
     using D = hn::CappedTag<float, kSize>;
     using V = hn::Vec<D>;
     static constexpr size_t kLanes = hn::MaxLanes(D());
+
+    /// Of a ray what lies so many bytes behind the beginning of a TracedRay.
+    HWY_INLINE const float& number(size_t lane, size_t offset) const {
+        return quads_[offset / kQuadBytes][4 * lane + offset % kQuadBytes / sizeof(float)];
+    }
+    HWY_INLINE float& number(size_t lane, size_t offset) {
+        return quads_[offset / kQuadBytes][4 * lane + offset % kQuadBytes / sizeof(float)];
+    }
 
     /// What Sheared::minus_edge_error comes to for the largest triangles of each size that a ray can hit, and less.
     /// EXACTNESS.md, 8.

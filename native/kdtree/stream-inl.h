@@ -110,14 +110,14 @@ enum class Order { kNearest, kSoonest };
 
 /// Stacks the children that the ray enters, and those to be looked at first last. With how far away they are, where
 /// the nearest counts: only there does a ray's reach become shorter.
-template <Order kOrder, bool kDepths>
-HWY_INLINE void stack_children(StreamRay& ray, const WideNode& node, const ChildEntries& entries) {
+template <bool kDepths>
+HWY_INLINE void stack_children(StreamRay& ray, const WideNode& node, const ChildEntries& entries, Order order) {
 #if HWY_TARGET != HWY_SSE4 && HWY_TARGET != HWY_NEON
     // Permuted into that order and compressed onto the stack, without a branch on their number.
     const hn::CappedTag<float, WideNode::kWidth> d;
     const hn::RebindToUnsigned<decltype(d)> du;
     auto ranks = hn::Zero(du);
-    if constexpr (kOrder == Order::kSoonest) {
+    if (order == Order::kSoonest) {
         ranks = hn::ShiftRight<WideNode::kSoonestShift>(hn::Load(du, node.order));
     } else {
         const auto all = hn::Set(du, node.order[ray.octant]);
@@ -137,7 +137,7 @@ HWY_INLINE void stack_children(StreamRay& ray, const WideNode& node, const Child
 #else
     uint32_t near = node.order[ray.octant];
     for (int i = 0; i < WideNode::kWidth; ++i, near >>= 3) {
-        const uint32_t slot = kOrder == Order::kSoonest ? node.order[i] >> WideNode::kSoonestShift : near & 7U;
+        const uint32_t slot = order == Order::kSoonest ? node.order[i] >> WideNode::kSoonestShift : near & 7U;
         *ray.top = node.child[slot];
         if constexpr (kDepths) {
             *ray.top_depth() = entries.depth[slot];
@@ -147,8 +147,8 @@ HWY_INLINE void stack_children(StreamRay& ray, const WideNode& node, const Child
 #endif
 }
 
-template <Order kOrder, bool kDepths>
-HWY_INLINE void visit_node(StreamRay& ray, const WideNode& node) {
+template <bool kDepths>
+HWY_INLINE void visit_node(StreamRay& ray, const WideNode& node, Order order) {
     const hn::CappedTag<float, WideNode::kWidth> d;
     constexpr size_t kLanes = hn::MaxLanes(hn::CappedTag<float, WideNode::kWidth>());
     const float* planes = node.lower[0];
@@ -169,7 +169,7 @@ HWY_INLINE void visit_node(StreamRay& ray, const WideNode& node) {
         entries.met |= mask_bits(d, span.meets()) << first;
 #endif
     }
-    stack_children<kOrder, kDepths>(ray, node, entries);
+    stack_children<kDepths>(ray, node, entries, order);
 }
 
 /// Traces rays through a tree. For any hit a ray ends at the first.
@@ -202,9 +202,9 @@ class Stream {
             for (uint32_t i = 0; i < nodes; ++i) {
                 StreamRay& ray = *node_list_[i];
                 if (ray.is_full()) [[unlikely]] {
-                    ray.template spill<!kAnyHit>(overflow_[&ray - ray_]);
+                    ray.spill<!kAnyHit>(overflow_[&ray - ray_]);
                 }
-                in_order([&]<Order kOrder> { visit_node<kOrder, !kAnyHit>(ray, nodes_[ray.next]); });
+                visit_node<!kAnyHit>(ray, nodes_[ray.next], order());
             }
             // In a loop of its own: what a node has put on a stack is long in coming, and while one ray waited for it,
             // a processor could look ahead to no more than a few others.
@@ -256,7 +256,7 @@ class Stream {
             for (uint32_t i = 0; i < ended; ++i) {
                 StreamRay& ray = *end_list_[i];
                 if (ray.overflow != 0) [[unlikely]] {
-                    ray.template refill<!kAnyHit>(overflow_[&ray - ray_]);
+                    ray.refill<!kAnyHit>(overflow_[&ray - ray_]);
                     list(ray, *--ray.top, lists);
                     continue;
                 }
@@ -293,16 +293,8 @@ class Stream {
         uint32_t possible;
     };
 
-    /// Calls f<order>() for the order in which rays look at children. On demand the nearest come first, where others
-    /// have been: what costs most there is to open what none has seen.
-    template <class F>
-    HWY_INLINE void in_order(const F& f) const {
-        if (kAnyHit && on_demand_ == nullptr) {
-            f.template operator()<Order::kSoonest>();
-        } else {
-            f.template operator()<Order::kNearest>();
-        }
-    }
+    /// On demand the nearest come first, where others have been: what costs most there is to open what none has seen.
+    HWY_INLINE Order order() const { return kAnyHit && on_demand_ == nullptr ? Order::kSoonest : Order::kNearest; }
 
     /// Puts the next ray, if there is one, in place of one that has ended.
     template <class Done>
@@ -315,7 +307,7 @@ class Stream {
         batch_.copy(lane, ray);
         ray.number = first_ + lane;
         ray.clear_stack();
-        in_order([&]<Order kOrder> { stack_children<kOrder, !kAnyHit>(ray, nodes_[0], batch_.root_entries(lane)); });
+        stack_children<!kAnyHit>(ray, nodes_[0], batch_.root_entries(lane), order());
         // Not fetched: with as many rays going there, it is at hand.
         list(ray, *--ray.top, lists);
     }

@@ -120,8 +120,8 @@ inline DepthsResult depths_of(const Ray& ray, float extent, const Box3f& box) {
         batch.copy(lane, *stream_ray);
         stream_ray->clear_stack();
     }
-    stack_children<Order::kNearest, true>(at_root, root, entries);
-    visit_node<Order::kNearest, true>(at_node, root);
+    stack_children<true>(at_root, root, entries, Order::kNearest);
+    visit_node<true>(at_node, root, Order::kNearest);
     const auto count = at_root.top - at_root.children;
     result.is_like_a_node = at_node.top - at_node.children == count &&
                             std::equal(at_root.children, at_root.top, at_node.children) &&
@@ -160,9 +160,9 @@ inline std::vector<uint32_t> stack_of(const WideNode& node, uint32_t octant, uin
     ray.octant = octant;
     ray.clear_stack();
     if (soonest_first) {
-        stack_children<Order::kSoonest, false>(ray, node, entries);
+        stack_children<false>(ray, node, entries, Order::kSoonest);
     } else {
-        stack_children<Order::kNearest, true>(ray, node, entries);
+        stack_children<true>(ray, node, entries, Order::kNearest);
     }
     return {ray.children + 1, ray.top};
 }
