@@ -20,6 +20,7 @@
 
 #include "kdtree/ray_batch-inl.h"
 #include "kdtree/root_leaves-inl.h"
+#include "kdtree/second_cache.h"
 #include "kdtree/traced_ray-inl.h"
 #include "kdtree/triangle_test-inl.h"
 
@@ -180,7 +181,7 @@ class Stream {
         : nodes_(tree.wide_nodes.data()),
           blocks_(tree.blocks.data()),
           on_demand_(tree.on_demand.get()),
-          fetches_(tree.wide_nodes.bytes() + tree.blocks.bytes() > kCached),
+          fetches_(tree.wide_nodes.bytes() + tree.blocks.bytes() > kNear * second_cache_bytes()),
           rays_(rays),
           batch_(tree.bounds),
           root_leaves_(nodes_[0], blocks_) {}
@@ -270,8 +271,9 @@ class Stream {
     /// So many that, with what is noted of them and fetched for them, they fit into a processor's first cache of 32
     /// KiB.
     static constexpr uint32_t kInFlight = 24;
-    /// Bytes of nodes and blocks that processors keep so near that fetching ahead costs more than it gains.
-    static constexpr size_t kCached = size_t{10} << 20;
+    /// Nodes and blocks that take no more than so many times a core's second cache are so near that fetching ahead
+    /// costs more than it gains.
+    static constexpr size_t kNear = kBlocksPerStep == 2 ? 10 : 4;
     /// Lines of 64 bytes that are fetched of a node, and of a leaf from where a ray goes on, of whose blocks each has
     /// five.
     static constexpr size_t kLinesOfNode = sizeof(WideNode) / 64;
