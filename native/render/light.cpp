@@ -11,6 +11,9 @@ namespace {
 
 constexpr double kPi = std::numbers::pi;
 
+/// More than rounding does to any sine or cosine here.
+constexpr double kRounding = 1e-6;
+
 void require(bool holds, const char* what) {
     if (!holds)
         throw std::invalid_argument(what);
@@ -42,10 +45,12 @@ Light::Light(const LightInput& input, Vec3d scene_centre) : shadow_(input.shadow
         case LightKind::kSpot:
             spot_ = true;
             cos_half_ = std::cos(input.spot_size * 0.5);
+            sin_half_ = std::sin(input.spot_size * 0.5);
             spot_fade_ = (1.0 - cos_half_) * input.spot_blend;
             span_x_ = unscaled(input.matrix.column(0), {1.0, 0.0, 0.0});
             span_y_ = unscaled(input.matrix.column(1), {0.0, 1.0, 0.0});
             axis_ = -unscaled(input.matrix.column(2), {0.0, 0.0, 1.0});
+            spot_stretch_ = std::sqrt(dot(span_x_, span_x_) + dot(span_y_, span_y_) + dot(axis_, axis_));
             [[fallthrough]];
         case LightKind::kPoint:
             kind_ = Kind::kBulb;
@@ -54,6 +59,7 @@ Light::Light(const LightInput& input, Vec3d scene_centre) : shadow_(input.shadow
         case LightKind::kSun:
             kind_ = Kind::kSun;
             cos_half_ = std::cos(std::min(input.angle, kPi) * 0.5);
+            sin_half_ = std::sin(std::min(input.angle, kPi) * 0.5);
             strength_ = power;
             break;
         case LightKind::kArea:
@@ -87,6 +93,24 @@ std::optional<LightSample> Light::sample(Vec3d point, Vec3d normal, Sample2 s) c
     return std::nullopt;
 }
 
+bool Light::may_reach(Vec3d point, Vec3d normal) const {
+    switch (kind_) {
+        case Kind::kBulb: {
+            const Vec3d from_light = point - position_;
+            const double beyond = dot(normal, from_light) - radius_;
+            const bool is_behind =
+                beyond > 0.0 && beyond * beyond > kRounding * kRounding * dot(from_light, from_light);
+            return !is_behind && !(spot_ && is_beyond_cone(from_light));
+        }
+        case Kind::kSun:
+            return dot(normal, axis_) <= sin_half_ + kRounding;
+        case Kind::kArea:
+        case Kind::kSky:
+            break;
+    }
+    return true;
+}
+
 /// A bulb is a disk that always faces the point, as in Cycles with its default soft falloff.
 std::optional<LightSample> Light::sample_bulb(Vec3d point, Vec3d normal, Sample2 s) const {
     const Vec3d from_light = point - position_;
@@ -105,8 +129,20 @@ std::optional<LightSample> Light::sample_bulb(Vec3d point, Vec3d normal, Sample2
     return LightSample{to_light, false, strength_ * (falloff * distance * tilt / (square * square))};
 }
 
+Vec3d Light::as_spot_has_it(Vec3d from_light) const {
+    return {dot(from_light, span_x_), dot(from_light, span_y_), dot(from_light, axis_)};
+}
+
+/// Whether that holds from every point of the bulb, of which none turns the direction by more than its radius does.
+bool Light::is_beyond_cone(Vec3d from_light) const {
+    const Vec3d local = as_spot_has_it(from_light);
+    const double distance = length(local);
+    const double sine = radius_ * spot_stretch_ / distance;
+    return sine < 1.0 && local.z < distance * (cos_half_ * std::sqrt(1.0 - sine * sine) - sin_half_ * sine - kRounding);
+}
+
 double Light::spot_falloff(Vec3d from_light) const {
-    const Vec3d local{dot(from_light, span_x_), dot(from_light, span_y_), dot(from_light, axis_)};
+    const Vec3d local = as_spot_has_it(from_light);
     const double cosine = local.z / length(local);
     if (!(cosine > cos_half_))
         return 0.0;

@@ -137,6 +137,8 @@ class TileTracer {
         for (const Shade& shade : shades_) {
             PixelSum& pixel = pixels_[shade.pixel];
             const SurfacePoint& surface = shade.surface;
+            if (!light.may_reach(surface.position, surface.shading_normal))
+                continue;
             const auto sample = light.sample(surface.position, surface.shading_normal,
                                              random(film, pixel, shade.sample, 1 + static_cast<uint32_t>(index)));
             if (!sample)

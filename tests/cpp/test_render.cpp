@@ -2,6 +2,7 @@
 #include <gtest/gtest.h>
 
 #include <cmath>
+#include <map>
 #include <numbers>
 #include <random>
 #include <set>
@@ -103,6 +104,58 @@ TEST(Render, SamplesAreStratifiedInEachRunOfAPowerOfTwo) {
             EXPECT_EQ(rows.size(), 16U);
             EXPECT_EQ(cells.size(), 16U);
         }
+    }
+}
+
+/// Lights of each kind, moved, turned and stretched, some with no width and some as wide as they get.
+LightInput some_light(Random& random) {
+    constexpr LightKind kKinds[] = {LightKind::kPoint, LightKind::kSpot, LightKind::kSun, LightKind::kArea};
+    LightInput input{};
+    input.kind = kKinds[static_cast<size_t>(random.uniform(0, 4))];
+    const Vec3d z = normalize(random.point(1.0));
+    const Tangents sides = tangents(z);
+    const Vec3d stretch{random.uniform(0.3, 3.0), random.uniform(0.3, 3.0), random.uniform(0.3, 3.0)};
+    const Vec3d at = random.point(2.0);
+    for (size_t i = 0; i < 3; ++i) {
+        const int axis = static_cast<int>(i);
+        input.matrix.rows[i][0] = sides.x[axis] * stretch.x;
+        input.matrix.rows[i][1] = sides.y[axis] * stretch.y;
+        input.matrix.rows[i][2] = z[axis] * stretch.z;
+        input.matrix.rows[i][3] = at[axis];
+    }
+    input.color = {1.0, 1.0, 1.0};
+    input.energy = 1.0;
+    const bool has_width = random.uniform(0, 1) < 0.8;
+    input.radius = has_width ? random.uniform(0, 1.5) : 0.0;
+    input.angle = has_width ? random.uniform(0, std::numbers::pi) : 0.0;
+    input.spot_size = random.uniform(0, std::numbers::pi);
+    input.size = input.size_y = 1.0;
+    return input;
+}
+
+TEST(Render, LightsReachWhatAnySampleOfThemReaches) {
+    Random random;
+    std::map<LightKind, int> unreached;
+    std::map<LightKind, int> samples;
+    for (int i = 0; i < 4000; ++i) {
+        const LightInput input = some_light(random);
+        const Light light(input, {0.0, 0.0, 0.0});
+        const Vec3d point = random.point(4.0);
+        const Vec3d normal = normalize(random.point(1.0));
+        const bool may_reach = light.may_reach(point, normal);
+        unreached[input.kind] += may_reach ? 0 : 1;
+        for (uint32_t s = 0; s < 64; ++s) {
+            const bool reaches = light.sample(point, normal, sample_2d(s, static_cast<uint32_t>(i))).has_value();
+            samples[input.kind] += reaches ? 1 : 0;
+            ASSERT_TRUE(may_reach || !reaches) << i;
+        }
+    }
+    // Of a thousand points each, half lie behind a lamp; of those before a spot most are outside its cone.
+    EXPECT_GT(unreached[LightKind::kPoint], 300);
+    EXPECT_GT(unreached[LightKind::kSpot], 600);
+    EXPECT_GT(unreached[LightKind::kSun], 150);
+    for (const LightKind kind : {LightKind::kPoint, LightKind::kSpot, LightKind::kSun}) {
+        EXPECT_GT(samples[kind], 5000) << static_cast<int>(kind);
     }
 }
 
