@@ -18,9 +18,9 @@
 #include <span>
 #include <utility>
 
+#include "kdtree/l2_cache.h"
 #include "kdtree/ray_batch-inl.h"
 #include "kdtree/root_leaves-inl.h"
-#include "kdtree/second_cache.h"
 #include "kdtree/traced_ray-inl.h"
 #include "kdtree/triangle_test-inl.h"
 
@@ -181,7 +181,7 @@ class Stream {
         : nodes_(tree.wide_nodes.data()),
           blocks_(tree.blocks.data()),
           on_demand_(tree.on_demand.get()),
-          fetches_(tree.wide_nodes.bytes() + tree.blocks.bytes() > kNear * second_cache_bytes()),
+          fetches_(tree.wide_nodes.bytes() + tree.blocks.bytes() > near_bytes()),
           rays_(rays),
           batch_(tree.bounds),
           root_leaves_(nodes_[0], blocks_) {}
@@ -271,9 +271,9 @@ class Stream {
     /// So many that, with what is noted of them and fetched for them, they fit into a processor's first cache of 32
     /// KiB.
     static constexpr uint32_t kInFlight = 24;
-    /// Nodes and blocks that take no more than so many times a core's second cache are so near that fetching ahead
-    /// costs more than it gains.
-    static constexpr size_t kNear = kBlocksPerStep == 2 ? 10 : 4;
+    /// Nodes and blocks that take no more bytes are so near that fetching ahead costs more than it gains. Where steps
+    /// take two blocks measured with an L2 cache of 1 MiB only.
+    static size_t near_bytes() { return kBlocksPerStep == 2 ? size_t{10} << 20 : 4 * l2_cache_bytes(); }
     /// Lines of 64 bytes that are fetched of a node, and of a leaf from where a ray goes on, of whose blocks each has
     /// five.
     static constexpr size_t kLinesOfNode = sizeof(WideNode) / 64;

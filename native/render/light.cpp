@@ -11,7 +11,7 @@ namespace {
 
 constexpr double kPi = std::numbers::pi;
 
-/// More than rounding does to any sine or cosine here.
+/// More than rounding does to a sine or cosine, even of spots stretched 10^10 times as far one way as another.
 constexpr double kRounding = 1e-6;
 
 void require(bool holds, const char* what) {
@@ -103,7 +103,7 @@ bool Light::may_reach(Vec3d point, Vec3d normal) const {
             return !is_behind && !(spot_ && is_beyond_cone(from_light));
         }
         case Kind::kSun:
-            return dot(normal, axis_) <= sin_half_ + kRounding;
+            return !(dot(normal, axis_) > sin_half_ + kRounding);
         case Kind::kArea:
         case Kind::kSky:
             break;
@@ -129,20 +129,21 @@ std::optional<LightSample> Light::sample_bulb(Vec3d point, Vec3d normal, Sample2
     return LightSample{to_light, false, strength_ * (falloff * distance * tilt / (square * square))};
 }
 
-Vec3d Light::as_spot_has_it(Vec3d from_light) const {
+Vec3d Light::to_spot_space(Vec3d from_light) const {
     return {dot(from_light, span_x_), dot(from_light, span_y_), dot(from_light, axis_)};
 }
 
-/// Whether that holds from every point of the bulb, of which none turns the direction by more than its radius does.
+/// Whether the point lies outside the cone as seen from every point of the bulb: to move by its radius turns the
+/// direction by an angle whose sine is at most radius times stretch over distance.
 bool Light::is_beyond_cone(Vec3d from_light) const {
-    const Vec3d local = as_spot_has_it(from_light);
+    const Vec3d local = to_spot_space(from_light);
     const double distance = length(local);
     const double sine = radius_ * spot_stretch_ / distance;
     return sine < 1.0 && local.z < distance * (cos_half_ * std::sqrt(1.0 - sine * sine) - sin_half_ * sine - kRounding);
 }
 
 double Light::spot_falloff(Vec3d from_light) const {
-    const Vec3d local = as_spot_has_it(from_light);
+    const Vec3d local = to_spot_space(from_light);
     const double cosine = local.z / length(local);
     if (!(cosine > cos_half_))
         return 0.0;

@@ -46,7 +46,7 @@ class Light {
     /// `normal` is the unit shading normal at `point`; nothing arrives from below it. `s` picks the sample.
     std::optional<LightSample> sample(Vec3d point, Vec3d normal, Sample2 s) const;
 
-    /// False only where no sample brings any light, which is found in less time than one takes.
+    /// False only where no sample brings light; quicker than taking one.
     bool may_reach(Vec3d point, Vec3d normal) const;
 
     bool casts_shadow() const { return shadow_; }
@@ -58,7 +58,7 @@ class Light {
     std::optional<LightSample> sample_sun(Vec3d normal, Sample2 s) const;
     std::optional<LightSample> sample_area(Vec3d point, Vec3d normal, Sample2 s) const;
     LightSample sample_sky(Vec3d normal, Sample2 s) const;
-    Vec3d as_spot_has_it(Vec3d from_light) const;
+    Vec3d to_spot_space(Vec3d from_light) const;
     double spot_falloff(Vec3d from_light) const;
     bool is_beyond_cone(Vec3d from_light) const;
 
@@ -70,7 +70,7 @@ class Light {
     Vec3d nadir_;            // sky: W/m²/sr
     Vec3d span_x_, span_y_;  // area: its sides; spot: rows that measure a direction across the cone
     double radius_ = 0.0, cos_half_ = 1.0, sin_half_ = 0.0, spot_fade_ = 0.0;
-    double spot_stretch_ = 0.0;  // no direction becomes longer by more than this when it is measured across the cone
+    double spot_stretch_ = 0.0;  // spot: measuring a vector across the cone lengthens it by no more (Frobenius norm)
 };
 
 }  // namespace espalier

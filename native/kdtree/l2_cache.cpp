@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-#include "kdtree/second_cache.h"
+#include "kdtree/l2_cache.h"
 
 #include <unistd.h>
 
@@ -17,8 +17,8 @@ size_t ask_the_system() {
 
 }  // namespace
 
-size_t second_cache_bytes() {
-    // Asked once: where the processor is a virtual one, its host answers, which takes microseconds.
+size_t l2_cache_bytes() {
+    // Asked once, since some C libraries ask the processor each time, which in a virtual machine takes microseconds.
     static const size_t bytes = ask_the_system();
     return bytes;
 }
