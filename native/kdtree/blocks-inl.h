@@ -30,12 +30,33 @@ HWY_INLINE V longest_side(const V (&corners)[3][3]) {
     return longest;
 }
 
+/// Fetches triangles of the blocks that come after the one that is written.
+HWY_INLINE void prefetch_blocks(const TriangleSoup& soup, const uint32_t* triangles, size_t block, size_t count) {
+    constexpr size_t kIndicesAhead = 12;
+    constexpr size_t kCornersAhead = 5;
+    const auto lane = [&](size_t b, size_t i) {
+        const uint32_t triangle = triangles[b * kBlockSize + i];
+        return triangle == kNoTriangle ? 0 : triangle;
+    };
+    if (block + kIndicesAhead < count) {
+        for (size_t i = 0; i < kBlockSize; ++i) {
+            prefetch_indices(soup, lane(block + kIndicesAhead, i));
+        }
+    }
+    if (block + kCornersAhead < count) {
+        for (size_t i = 0; i < kBlockSize; i += 2) {  // neighbours share corners
+            prefetch_corner(soup, lane(block + kCornersAhead, i));
+        }
+    }
+}
+
 inline void write_blocks(const TriangleSoup& soup, SizeClasses classes, const uint32_t* triangles, size_t count,
                          TriangleBlock* blocks) {
     const hn::CappedTag<float, kBlockSize> d;
     const hn::RebindToUnsigned<decltype(d)> du;
     const auto missing = hn::Set(du, kNoTriangle);
     for (size_t b = 0; b < count; ++b) {
+        prefetch_blocks(soup, triangles, b, count);
         auto longest = hn::Zero(d);
         for (size_t lane = 0; lane < kBlockSize; lane += hn::Lanes(d)) {
             const auto triangle = hn::LoadU(du, triangles + b * kBlockSize + lane);

@@ -13,6 +13,7 @@
 #include "geometry/triangle.h"
 #include "kdtree/box_union-inl.h"
 #include "kdtree/build_kernels.h"
+#include "kdtree/corners-inl.h"
 
 HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
@@ -51,8 +52,8 @@ inline void make_reference(const TriangleSoup& soup, uint32_t triangle, const Re
 inline uint32_t make_references(const TriangleSoup& soup, uint32_t begin, uint32_t end, const References& out,
                                 Box3f& bounds, RejectedFaces& rejected) {
     const hn::ScalableTag<float> df;
-    const hn::RebindToSigned<decltype(df)> di;
     const hn::RebindToUnsigned<decltype(df)> du;
+    constexpr uint32_t kAhead = 32;
     using F = hn::Vec<decltype(df)>;
     const uint32_t lanes = static_cast<uint32_t>(hn::Lanes(df));
     const auto zero = hn::Zero(df);
@@ -61,14 +62,18 @@ inline uint32_t make_references(const TriangleSoup& soup, uint32_t begin, uint32
     uint32_t count = 0;
     uint32_t triangle = begin;
     for (; triangle + lanes <= end; triangle += lanes) {
-        hn::Vec<decltype(du)> corner[3];
-        hn::LoadInterleaved3(du, soup.triangles.data() + size_t{3} * triangle, corner[0], corner[1], corner[2]);
+        for (uint32_t ahead = triangle + kAhead; ahead < std::min(triangle + kAhead + lanes, end); ++ahead) {
+            prefetch_corner(soup, ahead);
+        }
+        const auto number = hn::Iota(du, triangle);
+        alignas(64) uint32_t numbers[hn::MaxLanes(df)];
+        hn::Store(number, du, numbers);
         F v[3][3];
+        load_corners(df, soup, numbers, v);
         auto valid = hn::Eq(zero, zero);
         for (int k = 0; k < 3; ++k) {
-            const auto index = hn::BitCast(di, hn::Add(corner[k], hn::Add(corner[k], corner[k])));
             for (int axis = 0; axis < 3; ++axis) {
-                v[k][axis] = hn::Add(hn::GatherIndex(df, soup.positions.data() + axis, index), zero);
+                v[k][axis] = hn::Add(v[k][axis], zero);
                 valid = hn::And(valid, hn::Le(hn::Abs(v[k][axis]), limit));
             }
         }
@@ -97,7 +102,7 @@ inline uint32_t make_references(const TriangleSoup& soup, uint32_t begin, uint32
             hn::StoreU(high, df, out.upper[a] + count);
             seen.extend(axis, low, high);
         }
-        hn::StoreU(hn::Iota(du, triangle), du, out.triangle + count);
+        hn::StoreU(number, du, out.triangle + count);
         count += lanes;
     }
     for (; triangle < end; ++triangle) {

@@ -73,8 +73,8 @@ class Builder {
             make_references_alone(subtrees);
             phases.bounds = watch.lap();
         } else {
-            top.emplace(soup_, parameters_, cancel_, threads_, LaterUse::kSubtreesAndBlocks);
-            top->make_references(&*memory);
+            top.emplace(soup_, parameters_, cancel_, threads_, &*memory);
+            top->make_references();
             phases.bounds = watch.lap();
             tree_.report.rejected_faces = top->rejected();
             tree_.bounds = top->nodes()[0].node.cell;

@@ -59,6 +59,15 @@ HWY_INLINE void load_corners(D d, const TriangleSoup& soup, const uint32_t* tria
     }
 }
 
+/// Triangles of a leaf or a plane lie anywhere in the mesh: their indices are fetched ahead, and once those are there,
+/// a corner, which as a rule lies beside the other two.
+HWY_INLINE void prefetch_indices(const TriangleSoup& soup, uint32_t triangle) {
+    __builtin_prefetch(soup.triangles.data() + 3 * size_t{triangle});
+}
+HWY_INLINE void prefetch_corner(const TriangleSoup& soup, uint32_t triangle) {
+    __builtin_prefetch(soup.positions.data() + 3 * size_t{soup.triangles[3 * size_t{triangle}]});
+}
+
 }  // namespace espalier::HWY_NAMESPACE
 HWY_AFTER_NAMESPACE();
 #endif

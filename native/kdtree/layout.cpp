@@ -47,12 +47,6 @@ std::vector<BlockTask> cut_to_tasks(std::span<const TreePiece> pieces) {
     return tasks;
 }
 
-/// All threads together: the nodes above all runs lie far apart, most on a page of their own, and one thread writes
-/// them. What follows the last whole page is left to those who write there.
-void take_huge_pages(LargeBuffer<WideNode>& nodes, int threads) {
-    parallel_for(threads, nodes.bytes() / LargeBuffer<WideNode>::kHugePage, [&](size_t i) { nodes.take_huge_page(i); });
-}
-
 }  // namespace
 
 void build_layout(const TriangleSoup& soup, std::span<const TreePiece> pieces, int threads, TransientMemory& memory,
@@ -69,20 +63,20 @@ void build_layout(const TriangleSoup& soup, std::span<const TreePiece> pieces, i
     const SizeClasses classes(tree.bounds);
     LargeBuffer<SpreadPlan> plans = memory.take<SpreadPlan>(nodes);
     const Collapse collapse(tree.nodes.span(), pieces, {plans.data(), nodes});
-    parallel_for(threads, runs.size() + block_tasks.size(), [&](size_t i) {
-        if (i < runs.size()) {
-            collapse.plan(runs[i]);
+    parallel_for(threads, runs.size(), [&](size_t i) { collapse.plan(runs[i]); });
+    // What one thread alone can do, while the others write blocks.
+    std::vector<WideSubtree> subtrees;
+    parallel_for(threads, 1 + block_tasks.size(), [&](size_t i) {
+        if (i == 0) {
+            collapse.plan_above(runs);
+            tree.wide_nodes = LargeBuffer<WideNode>(collapse.wide_nodes(0));
+            subtrees = collapse.write_above(runs, tree.wide_nodes.data());
             return;
         }
-        const BlockTask& task = block_tasks[i - runs.size()];
+        const BlockTask& task = block_tasks[i - 1];
         tree.blocks.take_pages(task.place, task.place + task.count);
         build_kernels().write_blocks(soup, classes, task.triangles, task.count, tree.blocks.data() + task.place);
     });
-
-    collapse.plan_above(runs);
-    tree.wide_nodes = LargeBuffer<WideNode>(collapse.wide_nodes(0));
-    take_huge_pages(tree.wide_nodes, threads);
-    const std::vector<WideSubtree> subtrees = collapse.write_above(runs, tree.wide_nodes.data());
     parallel_for(threads, subtrees.size(), [&](size_t i) {
         const WideSubtree& subtree = subtrees[i];
         tree.wide_nodes.take_pages(subtree.place, subtree.place + collapse.wide_nodes(subtree.node));

@@ -72,6 +72,9 @@ HWY_INLINE void clip_straddlers(D d, const TriangleSoup& soup, Split split, cons
     }
     for (uint32_t begin = 0; begin < straddlers.count; begin += lanes) {
         const uint32_t active = std::min(lanes, straddlers.count - begin);
+        for (uint32_t i = begin + lanes; i < std::min(begin + 2 * lanes, straddlers.count); ++i) {
+            prefetch_corner(soup, left.triangle[straddlers.left[i]]);
+        }
         const auto at_left = hn::Load(di, reinterpret_cast<const int32_t*>(straddlers.left + begin));
         const auto at_right = hn::Load(di, reinterpret_cast<const int32_t*>(straddlers.right + begin));
         alignas(64) uint32_t triangles[hn::MaxLanes(D())];
@@ -273,6 +276,7 @@ inline Partition partition(const TriangleSoup& soup, const References& from, uin
                     left_count + static_cast<uint32_t>(std::popcount(left_bits & earlier));
                 straddlers.right[straddlers.count] =
                     right_count + static_cast<uint32_t>(std::popcount(right_bits & earlier));
+                prefetch_indices(soup, right.triangle[straddlers.right[straddlers.count]]);
                 ++straddlers.count;
             }
         }

@@ -8,6 +8,8 @@
 namespace espalier {
 namespace {
 
+constexpr size_t kPageWords = LargeBuffer<uint32_t>::kHugePage / sizeof(uint32_t);
+
 /// Small enough to share out among the threads and for the cache of one, large enough that a segment is still worth a
 /// vector loop a few levels down.
 uint32_t choose_segment_size(uint32_t triangles, int threads) {
@@ -22,9 +24,9 @@ uint32_t with_slack(uint32_t count) { return count + count / 4 + 2 * kMargin; }
 
 /// For the references that the top usually makes, and what all threads take to partition them; and for those of
 /// subtrees and for blocks, if they follow in the same memory.
-SegmentMemory memory_for(uint32_t triangles, uint32_t segment_size, int threads, LaterUse later_use) {
+SegmentMemory memory_for(uint32_t triangles, uint32_t segment_size, int threads, bool holds_subtrees) {
     const size_t places = triangles + size_t{2} * with_slack(segment_size) * static_cast<size_t>(threads + 1);
-    if (later_use == LaterUse::kNone) {
+    if (!holds_subtrees) {
         return SegmentMemory(places + triangles / 8);
     }
     return SegmentMemory(places + size_t{3} * triangles / 2, most_block_bytes(triangles), usual_block_bytes(triangles));
@@ -52,7 +54,7 @@ References SegmentMemory::take(uint32_t count) {
 }
 
 TopLevels::TopLevels(const TriangleSoup& soup, const BuildParameters& parameters, const std::atomic<bool>* cancel,
-                     int threads, LaterUse later_use)
+                     int threads, TransientMemory* transient)
     : soup_(soup),
       parameters_(parameters),
       cancel_(cancel),
@@ -60,12 +62,13 @@ TopLevels::TopLevels(const TriangleSoup& soup, const BuildParameters& parameters
       kernels_(build_kernels()),
       is_large_(is_large(soup, parameters)),
       segment_size_(choose_segment_size(soup.size(), threads)),
-      later_bytes_(later_use == LaterUse::kNone ? 0 : usual_block_bytes(soup.size())),
-      memory_(memory_for(soup.size(), segment_size_, threads, later_use)),
+      transient_(transient),
+      memory_(memory_for(soup.size(), segment_size_, threads, transient != nullptr)),
+      words_in_use_(std::max(transient == nullptr ? 0 : usual_block_bytes(soup.size()) / sizeof(uint32_t),
+                             memory_.first().words())),
       scratch_(static_cast<size_t>(threads)) {}
 
-void TopLevels::make_references(TransientMemory* transient) {
-    take_pages(transient);
+void TopLevels::make_references() {
     if (is_large_ && sort_root()) {
         return;
     }
@@ -75,7 +78,14 @@ void TopLevels::make_references(TransientMemory* transient) {
     std::vector<RejectedFaces> rejected(count);
     TopNode root{};
     root.segments.resize(count);
-    parallel_for(threads_, count, [&](size_t i) {
+    // Pages come first, but nobody waits for the last of them.
+    const size_t pages = is_large_ ? 0 : page_count();
+    parallel_for(threads_, pages + count, [&](size_t task) {
+        if (task < pages) {
+            take_page(task);
+            return;
+        }
+        const size_t i = task - pages;
         const auto begin = static_cast<uint32_t>(i * segment_size_);
         const uint32_t end = std::min(begin + segment_size_, triangles);
         const uint32_t capacity = with_slack(segment_size_);
@@ -97,28 +107,30 @@ void TopLevels::make_references(TransientMemory* transient) {
 
 /// Every thread takes pages of its own: two that first wrote to one page at the same time would both clear it. So do
 /// those that share the few huge pages of a small build's transient memory; of a large one's, many may not be needed.
-void TopLevels::take_pages(TransientMemory* transient) {
-    constexpr size_t kPage = LargeBuffer<uint32_t>::kHugePage / sizeof(uint32_t);
-    ReferenceBuffer& places = memory_.first();
-    const size_t words = std::max(later_bytes_ / sizeof(uint32_t), places.words());
-    const bool is_shared = transient != nullptr && transient->huge_pages() <= static_cast<size_t>(threads_);
-    const size_t others = is_shared ? transient->huge_pages() : 0;
-    parallel_for(threads_, others + words / kPage + 1, [&](size_t i) {
-        if (i < others) {
-            transient->take_huge_page(i);
-        } else {
-            const size_t page = i - others;
-            places.memory().take_pages(page * kPage, std::min(words, (page + 1) * kPage));
-        }
-    });
+size_t TopLevels::transient_pages() const {
+    const size_t pages = transient_ == nullptr ? 0 : transient_->huge_pages();
+    return pages <= static_cast<size_t>(threads_) ? pages : 0;
+}
+
+size_t TopLevels::page_count() const { return transient_pages() + words_in_use_ / kPageWords + 1; }
+
+void TopLevels::take_page(size_t page) {
+    if (page < transient_pages()) {
+        transient_->take_huge_page(page);
+        return;
+    }
+    const size_t begin = (page - transient_pages()) * kPageWords;
+    memory_.first().memory().take_pages(begin, std::min(words_in_use_, begin + kPageWords));
 }
 
 /// False if a sample has no plane for that, or if so many faces straddle its planes that they are not worth it.
 bool TopLevels::sort_root() {
+    size_t pages = page_count();
     for (Box3f bounds = bound_vertices();; bounds = root_.node.cell) {
         root_ = {};
         rejected_ = {};
-        root_.split = choose_multiway_split(bounds);
+        root_.split = choose_multiway_split(bounds, pages);
+        pages = 0;
         if (root_.split.leaves == 1) {
             return false;
         }
@@ -151,7 +163,8 @@ Box3f TopLevels::bound_vertices() const {
     return bounds;
 }
 
-MultiwaySplit TopLevels::choose_multiway_split(const Box3f& bounds) const {
+/// While one thread does, the others take so many pages.
+MultiwaySplit TopLevels::choose_multiway_split(const Box3f& bounds, size_t pages) {
     const uint32_t triangles = soup_.size();
     const uint32_t shift = sampling_shift(triangles);
     const ReferenceBuffer sample(sample_room((triangles >> shift) + kChunk));
@@ -170,7 +183,15 @@ MultiwaySplit TopLevels::choose_multiway_split(const Box3f& bounds) const {
         sampled += taken[i];
     }
     const OpenNode root{bounds, bounds, triangles, spare_references(triangles), 0};
-    return kernels_.choose_multiway_split(soup_, root, sample.references(), sampled, parameters_);
+    MultiwaySplit split;
+    parallel_for(threads_, 1 + pages, [&](size_t i) {
+        if (i == 0) {
+            split = kernels_.choose_multiway_split(soup_, root, sample.references(), sampled, parameters_);
+        } else {
+            take_page(i - 1);
+        }
+    });
+    return split;
 }
 
 void TopLevels::sort_faces() {

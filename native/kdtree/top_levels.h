@@ -54,18 +54,16 @@ struct UsedReferences {
     size_t used;
 };
 
-/// What else will lie in the memory of the top's references.
-enum class LaterUse { kNone, kSubtreesAndBlocks };
-
 /// Phases 1 and 2: the references and the top of the tree, all threads on one level at a time.
 class TopLevels {
  public:
+    /// transient: what subtrees will take, which then, and blocks after them, also lie in the memory of the references.
     TopLevels(const TriangleSoup& soup, const BuildParameters& parameters, const std::atomic<bool>* cancel, int threads,
-              LaterUse later_use);
+              TransientMemory* transient = nullptr);
 
     /// Phase 1: boxes of all faces that can be hit. Those of a large scene are sorted as they are made by the leaves of
-    /// a multiway split, so that they go through memory once. transient: whose huge pages are taken as well, if few.
-    void make_references(TransientMemory* transient = nullptr);
+    /// a multiway split, so that they go through memory once.
+    void make_references();
     /// Phase 2: splits every node of more than `cut` references, breadth first, but for a large scene's.
     void split_above(uint32_t cut);
 
@@ -83,10 +81,13 @@ class TopLevels {
         uint32_t node;
         uint32_t segment;
     };
-    void take_pages(TransientMemory* transient);
+    size_t transient_pages() const;
+    /// Of the memory that is usually needed.
+    size_t page_count() const;
+    void take_page(size_t page);
     bool sort_root();
     Box3f bound_vertices() const;
-    MultiwaySplit choose_multiway_split(const Box3f& bounds) const;
+    MultiwaySplit choose_multiway_split(const Box3f& bounds, size_t pages);
     void sort_faces();
     uint32_t add_nodes(uint32_t child, const Box3f& cell, int depth);
     std::vector<Part> parts_of(const std::vector<uint32_t>& nodes) const;
@@ -108,9 +109,10 @@ class TopLevels {
     const BuildKernels& kernels_;
     const bool is_large_;  ///< whether the root is split several levels at once, if it can be
     const uint32_t segment_size_;
-    const size_t later_bytes_;  ///< that are usually in use later; 0 if none
+    TransientMemory* const transient_;
     SegmentMemory memory_;
-    SortedNode root_;  ///< of one leaf, if the scene is not sorted
+    const size_t words_in_use_;  ///< of that, usually
+    SortedNode root_;            ///< of one leaf, if the scene is not sorted
     std::vector<TopNode> nodes_;
     std::vector<BinCounts> counts_;    ///< per part
     std::vector<References> scratch_;  ///< per thread
