@@ -10,6 +10,11 @@
 
 #include <hwy/highway.h>
 
+#include <algorithm>
+#include <cmath>
+#include <iterator>
+#include <numeric>
+
 #include "geometry/triangle.h"
 #include "kdtree/box_union-inl.h"
 #include "kdtree/build_kernels.h"
@@ -49,42 +54,48 @@ inline void make_reference(const TriangleSoup& soup, uint32_t triangle, const Re
     out.triangle[count++] = triangle;
 }
 
+/// The corners of as many faces as there are lanes, of which `first` is one and `end` none. False unless all of them
+/// can be hit for certain.
+template <class D, class V = hn::Vec<D>>
+HWY_INLINE bool load_faces(D d, const TriangleSoup& soup, uint32_t first, uint32_t end, V (&v)[3][3]) {
+    constexpr uint32_t kLanes = hn::MaxLanes(D());
+    constexpr uint32_t kAhead = 32;
+    for (uint32_t face = first + kAhead; face < std::min(first + kAhead + kLanes, end); ++face) {
+        prefetch_corner(soup, face);
+    }
+    uint32_t faces[kLanes];
+    std::iota(std::begin(faces), std::end(faces), first);
+    load_corners(d, soup, faces, v);
+    const V zero = hn::Zero(d);
+    const V limit = hn::Set(d, kMaxCoordinate);
+    auto valid = hn::Eq(zero, zero);
+    for (int k = 0; k < 3; ++k) {
+        for (int axis = 0; axis < 3; ++axis) {
+            v[k][axis] = hn::Add(v[k][axis], zero);
+            valid = hn::And(valid, hn::Le(hn::Abs(v[k][axis]), limit));
+        }
+    }
+    auto has_area = hn::Lt(zero, zero);
+    for (int axis = 0; axis < 3; ++axis) {
+        V value;
+        V bound;
+        cross_component(d, v, axis, value, bound);
+        has_area = hn::Or(has_area, hn::Gt(hn::Abs(value), bound));
+    }
+    return hn::AllTrue(d, hn::And(valid, has_area));
+}
+
 inline uint32_t make_references(const TriangleSoup& soup, uint32_t begin, uint32_t end, const References& out,
                                 Box3f& bounds, RejectedFaces& rejected) {
     const hn::ScalableTag<float> df;
     const hn::RebindToUnsigned<decltype(df)> du;
-    constexpr uint32_t kAhead = 32;
-    using F = hn::Vec<decltype(df)>;
     const uint32_t lanes = static_cast<uint32_t>(hn::Lanes(df));
-    const auto zero = hn::Zero(df);
-    const auto limit = hn::Set(df, kMaxCoordinate);
     BoxUnion seen(df);
     uint32_t count = 0;
     uint32_t triangle = begin;
     for (; triangle + lanes <= end; triangle += lanes) {
-        for (uint32_t ahead = triangle + kAhead; ahead < std::min(triangle + kAhead + lanes, end); ++ahead) {
-            prefetch_corner(soup, ahead);
-        }
-        const auto number = hn::Iota(du, triangle);
-        alignas(64) uint32_t numbers[hn::MaxLanes(df)];
-        hn::Store(number, du, numbers);
-        F v[3][3];
-        load_corners(df, soup, numbers, v);
-        auto valid = hn::Eq(zero, zero);
-        for (int k = 0; k < 3; ++k) {
-            for (int axis = 0; axis < 3; ++axis) {
-                v[k][axis] = hn::Add(v[k][axis], zero);
-                valid = hn::And(valid, hn::Le(hn::Abs(v[k][axis]), limit));
-            }
-        }
-        auto has_area = hn::Lt(zero, zero);
-        for (int axis = 0; axis < 3; ++axis) {
-            F value;
-            F bound;
-            cross_component(df, v, axis, value, bound);
-            has_area = hn::Or(has_area, hn::Gt(hn::Abs(value), bound));
-        }
-        if (!hn::AllTrue(df, hn::And(valid, has_area))) {
+        hn::Vec<decltype(df)> v[3][3];
+        if (!load_faces(df, soup, triangle, end, v)) {
             for (uint32_t lane = 0; lane < lanes; ++lane) {
                 const uint32_t at = count;
                 make_reference(soup, triangle + lane, out, count, rejected);
@@ -102,7 +113,7 @@ inline uint32_t make_references(const TriangleSoup& soup, uint32_t begin, uint32
             hn::StoreU(high, df, out.upper[a] + count);
             seen.extend(axis, low, high);
         }
-        hn::StoreU(number, du, out.triangle + count);
+        hn::StoreU(hn::Iota(du, triangle), du, out.triangle + count);
         count += lanes;
     }
     for (; triangle < end; ++triangle) {
@@ -114,6 +125,23 @@ inline uint32_t make_references(const TriangleSoup& soup, uint32_t begin, uint32
     }
     bounds.extend(seen.box());
     return count;
+}
+
+inline RejectedFaces count_rejected(const TriangleSoup& soup, uint32_t begin, uint32_t end) {
+    const hn::ScalableTag<float> d;
+    constexpr uint32_t kLanes = hn::MaxLanes(hn::ScalableTag<float>());
+    RejectedFaces rejected;
+    for (uint32_t first = begin; first < end; first += kLanes) {
+        hn::Vec<decltype(d)> v[3][3];
+        const bool is_whole = first + kLanes <= end;
+        if (is_whole && load_faces(d, soup, first, end, v)) {
+            continue;
+        }
+        for (uint32_t face = first; face < std::min(first + kLanes, end); ++face) {
+            rejected.count(classify_face(soup.vertex(face, 0), soup.vertex(face, 1), soup.vertex(face, 2)));
+        }
+    }
+    return rejected;
 }
 
 /// The box of those of the vertices [begin, end) that a face can have.

@@ -258,9 +258,9 @@ Split find_split(const OpenNode& node, const References& references, const Build
     return SplitSearch(parameters)(node, references);
 }
 
-constexpr BuildKernels kKernels{make_references, count_bins,    count_bins_along, choose_split, choose_finer_split,
-                                find_split,      partition,     bound_vertices,   sample_faces, choose_multiway_split,
-                                sort_by_leaves,  build_subtree, write_blocks};
+constexpr BuildKernels kKernels{make_references,       count_rejected, count_bins,    count_bins_along, choose_split,
+                                choose_finer_split,    find_split,     partition,     bound_vertices,   sample_faces,
+                                choose_multiway_split, sort_by_leaves, build_subtree, write_blocks};
 
 }  // namespace espalier::HWY_NAMESPACE
 HWY_AFTER_NAMESPACE();

@@ -110,6 +110,8 @@ struct BuildKernels {
     /// others.
     uint32_t (*make_references)(const TriangleSoup& soup, uint32_t begin, uint32_t end, const References& out,
                                 Box3f& bounds, RejectedFaces& rejected);
+    /// Of the faces of [begin, end), those that have no reference.
+    RejectedFaces (*count_rejected)(const TriangleSoup& soup, uint32_t begin, uint32_t end);
     /// Adds part of a node's references to its counts.
     void (*count_bins)(const OpenNode& node, const References& references, uint32_t count, BinCounts& counts);
     /// The same for one axis and the planes that cut an interval of it.

@@ -154,4 +154,8 @@ Tree build(const TriangleSoup& soup, const BuildOptions& options) {
     return tree;
 }
 
+RejectedFaces rejected_faces(const TriangleSoup& soup, uint32_t begin, uint32_t end) {
+    return build_kernels().count_rejected(soup, begin, end);
+}
+
 }  // namespace espalier

@@ -115,4 +115,7 @@ struct TriangleSoup {
 /// Throws BuildCancelled, std::bad_alloc, or std::length_error beyond 2^28 triangles.
 Tree build(const TriangleSoup& soup, const BuildOptions& options);
 
+/// Of the faces [begin, end), those that build() sets aside.
+RejectedFaces rejected_faces(const TriangleSoup& soup, uint32_t begin, uint32_t end);
+
 }  // namespace espalier

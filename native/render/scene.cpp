@@ -9,7 +9,6 @@
 #include <unordered_map>
 
 #include "geometry/float_environment.h"
-#include "geometry/triangle.h"
 #include "kdtree/parallel.h"
 
 namespace espalier {
@@ -67,21 +66,32 @@ struct Bounds {
     }
 };
 
+/// All threads together: two that first wrote to one page would both clear it.
+template <class T>
+void take_huge_pages(LargeBuffer<T>& buffer, int threads) {
+    parallel_for(threads, LargeBuffer<T>::huge_pages(buffer.bytes()), [&](size_t i) { buffer.take_huge_page(i); });
+}
+
 void check_mesh(const MeshInput& mesh) {
     const size_t vertices = mesh.positions.size() / 3;
     const size_t triangles = mesh.triangles.size() / 3;
-    for (size_t i = 0; i < mesh.triangles.size(); ++i) {
-        if (mesh.triangles[i] >= vertices) {
-            throw std::out_of_range("mesh '" + mesh.name + "': triangle " + std::to_string(i / 3) +
-                                    " has vertex index " + std::to_string(static_cast<int32_t>(mesh.triangles[i])) +
-                                    ", outside the mesh's " + std::to_string(vertices) + " vertices");
-        }
+    uint32_t largest = 0;
+    for (const uint32_t index : mesh.triangles)
+        largest = std::max(largest, index);
+    if (!mesh.triangles.empty() && largest >= vertices) {
+        const auto at = std::ranges::find_if(mesh.triangles, [&](uint32_t index) { return index >= vertices; });
+        throw std::out_of_range("mesh '" + mesh.name + "': triangle " +
+                                std::to_string((at - mesh.triangles.begin()) / 3) + " has vertex index " +
+                                std::to_string(static_cast<int32_t>(*at)) + ", outside the mesh's " +
+                                std::to_string(vertices) + " vertices");
     }
-    for (size_t i = 0; i < mesh.material_slots.size(); ++i) {
-        if (mesh.material_slots[i] < 0) {
-            throw std::out_of_range("mesh '" + mesh.name + "': material_slots of triangle " + std::to_string(i) +
-                                    " is negative");
-        }
+    int32_t least = 0;
+    for (const int32_t slot : mesh.material_slots)
+        least = std::min(least, slot);
+    if (least < 0) {
+        const auto at = std::ranges::find_if(mesh.material_slots, [](int32_t slot) { return slot < 0; });
+        throw std::out_of_range("mesh '" + mesh.name + "': material_slots of triangle " +
+                                std::to_string(at - mesh.material_slots.begin()) + " is negative");
     }
     const size_t normals = mesh.normals.size() / 3;
     const size_t expected = mesh.normal_kind == NormalKind::kFlat        ? 0
@@ -120,17 +130,19 @@ Scene::Scene(std::span<const MeshInput> meshes, std::span<const Placement> place
     const auto start = std::chrono::steady_clock::now();
     if (threads <= 0)
         threads = hardware_threads();
-    parallel_for(threads, meshes.size(), [&](size_t i) { check_mesh(meshes[i]); });
+    meshes_.resize(meshes.size());
+    parallel_for(threads, meshes.size(), [&](size_t i) {
+        const MeshInput& mesh = meshes[i];
+        check_mesh(mesh);
+        meshes_[i] = {mesh.normal_kind,
+                      {mesh.normals.begin(), mesh.normals.end()},
+                      {mesh.material_slots.begin(), mesh.material_slots.end()}};
+    });
     for (const Placement& placement : placements)
         check_placement(placement, meshes.size(), materials.size() / 3);
 
     for (size_t i = 0; i < materials.size() / 3; ++i)
         materials_.push_back({materials[3 * i], materials[3 * i + 1], materials[3 * i + 2]});
-    for (const MeshInput& mesh : meshes) {
-        meshes_.push_back({mesh.normal_kind,
-                           {mesh.normals.begin(), mesh.normals.end()},
-                           {mesh.material_slots.begin(), mesh.material_slots.end()}});
-    }
     place(meshes, placements, threads);
     const std::vector<size_t> object_of = name_objects(placements);
     count_rejected(object_of, threads);
@@ -153,8 +165,10 @@ void Scene::place(std::span<const MeshInput> meshes, std::span<const Placement> 
         }
     }
     first_triangle_.push_back(static_cast<uint32_t>(triangles));
-    positions_.resize(3 * vertices);
-    triangles_.resize(3 * triangles);
+    positions_ = LargeBuffer<float>(3 * vertices);
+    triangles_ = LargeBuffer<uint32_t>(3 * triangles);
+    take_huge_pages(positions_, threads);
+    take_huge_pages(triangles_, threads);
 
     const auto vertex_chunks =
         make_chunks(placements.size(), [&](size_t p) { return meshes[placements[p].mesh].positions.size() / 3; });
@@ -217,12 +231,9 @@ void Scene::count_rejected(const std::vector<size_t>& object_of, int threads) {
         make_chunks(object_of.size(), [&](size_t p) { return size_t{first_triangle_[p + 1]} - first_triangle_[p]; });
     std::vector<RejectedFaces> counts(chunks.size());
     parallel_for(threads, chunks.size(), [&](size_t c) {
-        RejectedFaces& rejected = counts[c];
-        for (size_t i = chunks[c].begin; i < chunks[c].end; ++i) {
-            const uint32_t* corners = &triangles_[3 * (first_triangle_[chunks[c].placement] + i)];
-            const auto corner = [&](int k) { return to_float(vertex(corners[k])); };
-            rejected.count(classify_face(corner(0), corner(1), corner(2)));
-        }
+        const size_t first = first_triangle_[chunks[c].placement];
+        counts[c] = rejected_faces(soup(), static_cast<uint32_t>(first + chunks[c].begin),
+                                   static_cast<uint32_t>(first + chunks[c].end));
     });
     for (size_t c = 0; c < chunks.size(); ++c)
         objects_[object_of[chunks[c].placement]].rejected += counts[c];
@@ -230,8 +241,9 @@ void Scene::count_rejected(const std::vector<size_t>& object_of, int threads) {
 
 void Scene::measure_precision(std::span<const MeshInput> meshes, std::span<const Placement> placements,
                               const std::vector<size_t>& object_of, int threads) {
-    if (!triangles_.empty())
-        precision_ = precision_at(precision_.distance, typical_edge(positions_, triangles_, kMostLookedAt));
+    if (triangles_.size() != 0)
+        precision_ =
+            precision_at(precision_.distance, typical_edge(positions_.span(), triangles_.span(), kMostLookedAt));
     std::vector<Precision> in_mesh(meshes.size());
     parallel_for(threads, meshes.size(), [&](size_t m) {
         in_mesh[m] = precision_at(typical_distance(meshes[m].positions, kMostLookedAt),
@@ -240,9 +252,9 @@ void Scene::measure_precision(std::span<const MeshInput> meshes, std::span<const
     const size_t most = std::max(kLeastLookedAt, kMostLookedAt / std::max<size_t>(1, placements.size()));
     std::vector<double> distances(placements.size());
     parallel_for(threads, placements.size(), [&](size_t p) {
-        const std::span<const float> all = positions_;
         distances[p] = typical_distance(
-            all.subspan(3 * size_t{placed_[p].first_vertex}, meshes[placements[p].mesh].positions.size()), most);
+            positions_.span().subspan(3 * size_t{placed_[p].first_vertex}, meshes[placements[p].mesh].positions.size()),
+            most);
     });
 
     const auto keep_worse = [](Precision& worst, const Precision& other) {
@@ -268,7 +280,7 @@ size_t Scene::placement_of(uint32_t triangle) const {
            1;
 }
 
-Vec3d Scene::vertex(uint32_t index) const { return load(positions_, index); }
+Vec3d Scene::vertex(uint32_t index) const { return load(positions_.span(), index); }
 
 SurfacePoint Scene::surface(uint32_t triangle, double u, double v, Vec3d direction) const {
     const size_t placement = placement_of(triangle);

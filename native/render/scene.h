@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "geometry/vec.h"
+#include "kdtree/large_buffer.h"
 #include "kdtree/tree.h"
 #include "render/matrix.h"
 #include "render/precision.h"
@@ -65,7 +66,7 @@ class Scene {
     Scene(std::span<const MeshInput> meshes, std::span<const Placement> placements, std::span<const float> materials,
           int threads = 0);
 
-    TriangleSoup soup() const { return {positions_, triangles_}; }
+    TriangleSoup soup() const { return {positions_.span(), triangles_.span()}; }
     /// The first triangle of each placement, then the number of all.
     std::span<const uint32_t> first_triangles() const { return first_triangle_; }
     size_t placement_of(uint32_t triangle) const;
@@ -100,8 +101,8 @@ class Scene {
                            const std::vector<size_t>& object_of, int threads);
     Vec3d vertex(uint32_t index) const;
 
-    std::vector<float> positions_;
-    std::vector<uint32_t> triangles_;
+    LargeBuffer<float> positions_;
+    LargeBuffer<uint32_t> triangles_;
     std::vector<uint32_t>
         first_triangle_;  // per placement, then the total: a triangle's placement is found by bisection
     std::vector<MeshShading> meshes_;

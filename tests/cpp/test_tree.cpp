@@ -372,6 +372,25 @@ TEST(Tree, TakesMeshesOfAlmostNothing) {
     }
 }
 
+TEST(Tree, CountsBadFacesOfAnyRange) {
+    Mesh mesh = make_sphere(20, 30);
+    const auto sound = static_cast<uint32_t>(mesh.triangles.size() / 3);
+    const uint32_t without_area = sound / 2;  // in the middle of sound ones
+    mesh.triangles[3 * without_area + 1] = mesh.triangles[3 * without_area];
+    mesh.add_triangle({0, 0, NAN}, {1, 0, 0}, {0, 1, 0});
+    mesh.add_triangle({0, 0, 0}, {1e30F, 0, 0}, {0, 1, 0});
+    const uint32_t end = sound + 2;
+    for (uint32_t length : {0U, 1U, 3U, 16U, 17U, 33U, end}) {
+        for (uint32_t begin = 0; begin + length <= end; ++begin) {
+            const auto holds = [&](uint32_t face) { return face >= begin && face < begin + length ? 1U : 0U; };
+            const RejectedFaces rejected = rejected_faces(mesh.soup(), begin, begin + length);
+            ASSERT_EQ(rejected.no_area, holds(without_area)) << begin << " " << length;
+            ASSERT_EQ(rejected.not_finite, holds(sound)) << begin << " " << length;
+            ASSERT_EQ(rejected.too_large, holds(sound + 1)) << begin << " " << length;
+        }
+    }
+}
+
 TEST(Tree, SetsBadFacesAsideAndCountsThem) {
     for (const int threads : {1, 2}) {
         Mesh mesh = make_sphere(20, 30);
