@@ -132,10 +132,34 @@ struct DepthLimits {
     }
 };
 
+/// What the box test asks of sixteen rays, as in TracedRay, a column each.
+struct BoxColumns {
+    static constexpr size_t kSize = 16;
+    alignas(64) float inverse[3][kSize];
+    alignas(64) float near_shift[3][kSize];
+    alignas(64) float far_shift[3][kSize];
+    alignas(64) float start[kSize];
+    alignas(64) float reach[kSize];
+    alignas(64) float octant[kSize];  ///< bits of a number
+
+    /// The rays that go there, a bit for each.
+    HWY_INLINE uint32_t in_octant(uint32_t wanted) const {
+        const hn::CappedTag<float, kSize> d;
+        const hn::RebindToUnsigned<decltype(d)> du;
+        uint32_t rays = 0;
+        for (size_t lane = 0; lane < kSize; lane += hn::Lanes(d)) {
+            const auto is_there = hn::Eq(hn::BitCast(du, hn::Load(d, octant + lane)), hn::Set(du, wanted));
+            rays |= static_cast<uint32_t>(mask_bits(d, hn::RebindMask(d, is_there))) << lane;
+        }
+        return rays;
+    }
+};
+
 /// Sets single rays up, as many at once as fill any register.
 class RayBatch {
  public:
-    static constexpr size_t kSize = 16;
+    static constexpr size_t kSize = BoxColumns::kSize;
+    using D = hn::CappedTag<float, kSize>;
 
     /// bounds: of the tree.
     explicit RayBatch(const Box3f& bounds) : bounds_(bounds), extent_(extent_of(bounds)) {
@@ -174,6 +198,25 @@ class RayBatch {
             hn::Store(hn::Load(d, quads_[quad] + 4 * lane), d, to + 4 * quad);
         }
         ray.place = place_[lane];
+    }
+
+    uint32_t octant(size_t lane) const { return std::bit_cast<uint32_t>(number(lane, offsetof(TracedRay, octant))); }
+
+    HWY_INLINE void copy(BoxColumns& columns) const {
+        const D d;
+        for (size_t lane = 0; lane < kSize; lane += kLanes) {
+            const auto load = [&](size_t quad, float (&xyz)[3][kSize], float (&last)[kSize]) {
+                V column[4];
+                hn::LoadInterleaved4(d, quads_[quad] + 4 * lane, column[0], column[1], column[2], column[3]);
+                for (size_t axis = 0; axis < 3; ++axis) {
+                    hn::Store(column[axis], d, xyz[axis] + lane);
+                }
+                hn::Store(column[3], d, last + lane);
+            };
+            load(offsetof(TracedRay, inverse) / kQuadBytes, columns.inverse, columns.start);
+            load(offsetof(TracedRay, near_shift) / kQuadBytes, columns.near_shift, columns.reach);
+            load(offsetof(TracedRay, far_shift) / kQuadBytes, columns.far_shift, columns.octant);
+        }
     }
 
     /// What the triangle test asks of a ray, as in TracedRay, and what holds for all triangles of the tree.
@@ -271,7 +314,6 @@ class RayBatch {
  private:
     static constexpr size_t kQuads = 8;
     static constexpr size_t kQuadBytes = 4 * sizeof(float);
-    using D = hn::CappedTag<float, kSize>;
     using V = hn::Vec<D>;
     static constexpr size_t kLanes = hn::MaxLanes(D());
 

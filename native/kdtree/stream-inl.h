@@ -20,6 +20,7 @@
 
 #include "kdtree/l2_cache.h"
 #include "kdtree/ray_batch-inl.h"
+#include "kdtree/ray_group-inl.h"
 #include "kdtree/root_leaves-inl.h"
 #include "kdtree/traced_ray-inl.h"
 #include "kdtree/triangle_test-inl.h"
@@ -306,15 +307,26 @@ class Stream {
         }
         const auto lane = static_cast<uint32_t>(std::countr_zero(waiting_));
         waiting_ &= waiting_ - 1;
-        batch_.copy(lane, ray);
-        ray.number = first_ + lane;
-        ray.clear_stack();
-        stack_children<!kAnyHit>(ray, nodes_[0], batch_.root_entries(lane), order());
+        set_out(lane, ray);
+        if (kAnyHit && has_walked_) {
+            // In the order in which the group came by: what comes first on top.
+            const StreamRay& member = members_[lane];
+            ray.top = std::reverse_copy(member.children + 1, static_cast<const uint32_t*>(member.top), ray.top);
+        } else {
+            stack_children<!kAnyHit>(ray, nodes_[0], batch_.root_entries(lane), order());
+        }
         // Not fetched: with as many rays going there, it is at hand.
         list(ray, *--ray.top, lists);
     }
 
-    /// Of which some rays have to be followed: the others have missed, or ended in a leaf below the root.
+    /// Fills a ray of the batch in, with nothing to visit.
+    HWY_INLINE void set_out(uint32_t lane, StreamRay& ray) const {
+        batch_.copy(lane, ray);
+        ray.number = first_ + lane;
+        ray.clear_stack();
+    }
+
+    /// Of which some rays have to be followed: the others have missed, or ended together or in a leaf below the root.
     template <class Done>
     HWY_NOINLINE bool set_up_next_batch(const Done& done) {
         do {
@@ -331,10 +343,85 @@ class Stream {
                 batch = filled_up;
             }
             waiting_ = batch_.set_up(batch, nodes_[0]) & ((1U << rays.size()) - 1);
+            has_walked_ = kAnyHit && on_demand_ == nullptr && group_.gather(batch_, waiting_);
+            if (has_walked_) {
+                waiting_ = walk_together(done);
+                continue;
+            }
             waiting_ = root_leaves_.visit(batch_, waiting_,
                                           [&](uint32_t lane, uint32_t place) { done(first_ + lane, place); });
         } while (waiting_ == 0);
         return true;
+    }
+
+    /// Leads those that wait through the tree as a group. Returns those that have neither ended nor been everywhere.
+    template <class Done>
+    HWY_INLINE uint32_t walk_together(const Done& done) {
+        for (uint32_t rest = waiting_; rest != 0; rest &= rest - 1) {
+            const auto lane = static_cast<uint32_t>(std::countr_zero(rest));
+            set_out(lane, members_[lane]);
+        }
+        const auto test = [&](uint32_t leaf, uint32_t rays) { return test_together(leaf, rays, done); };
+        uint32_t parted = 0;
+        const auto part = [&](uint32_t child, uint32_t rays) {
+            for (uint32_t rest = rays; rest != 0; rest &= rest - 1) {
+                if (members_[std::countr_zero(rest)].is_full()) {
+                    return false;
+                }
+            }
+            for (uint32_t rest = rays; rest != 0; rest &= rest - 1) {
+                *members_[std::countr_zero(rest)].top++ = child;
+            }
+            parted |= rays;
+            return true;
+        };
+        return group_.walk(nodes_, waiting_, test, part) & parted;
+    }
+
+    /// Where rays are asked first, returns those of a group's that may meet something in a block; else all.
+    HWY_INLINE uint32_t asked_together(uint32_t block, uint32_t rays) const {
+        if constexpr (!kAsksFirst) {
+            return rays;
+        }
+        uint32_t meeting = 0;
+        for (uint32_t rest = rays; rest != 0; rest &= rest - 1) {
+            const auto lane = static_cast<uint32_t>(std::countr_zero(rest));
+            meeting |= may_meet(members_[lane], blocks_[block]) << lane;
+        }
+        return meeting;
+    }
+
+    /// 1 where a ray of the stream may meet something in a block, else 0.
+    HWY_INLINE uint32_t may_meet(const StreamRay& ray, const TriangleBlock& block) const {
+        const float least_inside = batch_.least_inside()[block.triangle[0] / kMaxTriangles];
+        return at_most_one(lanes_in_question<kExact>(ray, block, least_inside));
+    }
+
+    /// Returns those of a group's rays that hit something in a leaf.
+    template <class Done>
+    HWY_INLINE uint32_t test_together(uint32_t leaf, uint32_t rays, const Done& done) {
+        const uint32_t blocks = WideNode::blocks(leaf);
+        uint32_t ended = 0;
+        for (uint32_t b = 0; b < blocks; b += kBlocksPerStep) {
+            const uint32_t first = WideNode::first_block(leaf) + b;
+            uint32_t meeting = 0;
+            for (uint32_t rest = asked_together(first, rays & ~ended); rest != 0; rest &= rest - 1) {
+                StreamRay& ray = members_[std::countr_zero(rest)];
+                Meeting& met = meetings_of_group_[meeting];
+                met.possible = test_blocks<kExact>(ray, blocks_ + first, at_most_one(blocks - 1 - b), met.verdict);
+                met.ray = &ray;
+                met.leaf = WideNode::leaf(first, 1);
+                meeting += at_most_one(met.possible);
+            }
+            for (uint32_t i = 0; i < meeting; ++i) {
+                StreamRay& ray = *meetings_of_group_[i].ray;
+                if (take(ray, meetings_of_group_[i])) {
+                    done(ray.number, ray.place);
+                    ended |= 1U << (ray.number - first_);
+                }
+            }
+        }
+        return ended;
     }
 
     /// Where rays are asked first, lets so many from the list of those at a leaf go on that meet nothing there, and
@@ -350,9 +437,7 @@ class Stream {
             const uint32_t leaf = ray.next;
             uint32_t meets = 1;
             if (!WideNode::is_unopened(leaf)) [[likely]] {
-                const TriangleBlock& block = blocks_[WideNode::first_block(leaf)];
-                const float least_inside = batch_.least_inside()[block.triangle[0] / kMaxTriangles];
-                meets = at_most_one(lanes_in_question<kExact>(ray, block, least_inside));
+                meets = may_meet(ray, blocks_[WideNode::first_block(leaf)]);
             }
             asked_list_[left] = &ray;
             passing_list_[passing] = &ray;
@@ -468,14 +553,18 @@ class Stream {
     std::span<const uint32_t> batches_;  ///< those not yet set up, by the numbers of their first rays
     RayBatch batch_;
     RootLeaves<kAnyHit, kExact> root_leaves_;
-    uint32_t first_ = 0;    ///< ray of the batch
-    uint32_t waiting_ = 0;  ///< those of it that are still to begin, a bit for each
+    uint32_t first_ = 0;       ///< ray of the batch
+    uint32_t waiting_ = 0;     ///< those of it that are still to begin, a bit for each
+    bool has_walked_ = false;  ///< as a group, and the rays that wait go on from where it left them
     StreamRay* node_list_[kInFlight + 1];
     StreamRay* leaf_list_[kInFlight + 1];
     StreamRay* asked_list_[kInFlight + 1];    ///< and may meet something there
     StreamRay* passing_list_[kInFlight + 1];  ///< and do not
     StreamRay* end_list_[kInFlight + 1];
     Meeting meetings_[kInFlight];
+    RayGroup group_;
+    StreamRay members_[RayBatch::kSize];  ///< of the group
+    Meeting meetings_of_group_[RayBatch::kSize];
     StreamRay ray_[kInFlight];
     Overflow overflow_[kInFlight];
 };

@@ -354,6 +354,103 @@ TEST(Traversal, RemembersAllThatWaits) {
     }
 }
 
+/// Rays of a group that have ever more to visit on their own: of sixteen beside each other four pass through seven
+/// boxes at each of 70 nodes below one another. What blocks them lies in the very last of these.
+TEST(Traversal, RaysOfAGroupRememberAllThatWaits) {
+    constexpr uint32_t kLevels = 70;
+    constexpr uint32_t kMissing = kLevels;  // a node with a triangle that no ray meets
+    constexpr uint32_t kMeeting = kLevels + 1;
+    Mesh mesh;
+    mesh.add_triangle({-1, 50, 10}, {4, 50, 10}, {-1, 55, 10});
+    mesh.add_triangle({-1, -1, 10}, {40, -1, 10}, {-1, 40, 10});
+    Tree tree = build(mesh.soup(), {Quality::kBalanced, 1});
+    tree.blocks = LargeBuffer<TriangleBlock>(2);
+    for (uint32_t b = 0; b < 2; ++b) {
+        for (uint32_t lane = 0; lane < kBlockSize; ++lane) {
+            tree.blocks[b].triangle[lane] = lane == 0 ? b : kNoTriangle;
+            for (int corner = 0; corner < 3; ++corner) {
+                for (int axis = 0; axis < 3; ++axis) {
+                    tree.blocks[b].vertex[corner][axis][lane] = lane == 0 ? mesh.soup().vertex(b, corner)[axis] : NAN;
+                }
+            }
+        }
+    }
+    tree.wide_nodes = LargeBuffer<WideNode>(kLevels + 2);
+    const auto set_child = [&](uint32_t node, uint32_t slot, uint32_t child, float end_of_x) {
+        for (int axis = 0; axis < 3; ++axis) {
+            tree.wide_nodes[node].lower[axis][slot] = -1;
+            tree.wide_nodes[node].upper[axis][slot] = axis == 0 ? end_of_x : 60;
+        }
+        tree.wide_nodes[node].child[slot] = child;
+    };
+    for (uint32_t n = 0; n < tree.wide_nodes.size(); ++n) {
+        for (uint32_t slot = 0; slot < WideNode::kWidth; ++slot) {
+            for (int axis = 0; axis < 3; ++axis) {
+                tree.wide_nodes[n].lower[axis][slot] = INFINITY;
+                tree.wide_nodes[n].upper[axis][slot] = -INFINITY;
+            }
+            tree.wide_nodes[n].order[slot] = 076543210U | slot << WideNode::kSoonestShift;  // slot 7 comes first
+            if (n < kLevels) {
+                set_child(n, slot, n == 0 && slot == 0 ? kMeeting : kMissing, 3.5F);
+            }
+        }
+        if (n + 1 < kLevels) {
+            set_child(n, WideNode::kWidth - 1, n + 1, 40);
+        }
+    }
+    set_child(kMissing, 0, WideNode::leaf(0, 1), 3.5F);
+    set_child(kMeeting, 0, WideNode::leaf(1, 1), 3.5F);
+    std::vector<Ray> rays;
+    for (uint32_t i = 0; i < 16; ++i) {
+        rays.push_back({{static_cast<float>(i), 0.5F + 0.01F * static_cast<float>(i), 0}, 0, {0, 0.001F, 1}, INFINITY});
+    }
+    std::vector<uint8_t> blocked(rays.size());
+    occluded(tree, rays, blocked);
+    for (uint32_t i = 0; i < rays.size(); ++i) {
+        EXPECT_EQ(blocked[i], i < 4 ? 1 : 0) << i;
+    }
+}
+
+/// From places that lie side by side to all of a lamp: such rays are led through the tree together, and those that look
+/// for the nearest hit are not.
+TEST(Traversal, GroupsEndWhereTheirRaysDo) {
+    std::mt19937 random(17);
+    const auto uniform = [&] { return static_cast<float>(random() >> 8) * 0x1p-24F; };
+    const Mesh meshes[] = {make_sphere(24, 32), make_soup(1500, 11), make_furball(3000), make_grid(20), make_room()};
+    for (const Mesh& mesh : meshes) {
+        const Tree tree = build(mesh.soup(), {});
+        const float room = 0.2F * length(tree.bounds.size());
+        const Vec3f size = tree.bounds.size() + Vec3f{room, room, room};
+        const Vec3f lower = tree.bounds.lower - Vec3f{room, room, room} * 0.5F;
+        const auto point = [&] { return Vec3f{uniform(), uniform(), uniform()}; };
+        size_t blocked_rays = 0;
+        size_t wrong = 0;
+        constexpr size_t kRays = 16;
+        constexpr uint32_t kGroups = 400;
+        for (uint32_t group = 0; group < kGroups; ++group) {
+            const Vec3f from = lower + size * point();
+            const Vec3f to = lower + size * point();
+            const float spread = group % 2 == 0 ? 0.02F : 0.2F;
+            std::vector<Ray> rays;
+            for (size_t i = 0; i < kRays; ++i) {
+                const Vec3f origin = from + size * point() * spread;
+                rays.push_back({origin, 0, to + size * point() * spread - origin, 1});
+            }
+            std::vector<uint8_t> blocked(kRays);
+            std::vector<Hit> hits(kRays);
+            occluded(tree, rays, blocked);
+            intersect(tree, rays, hits);
+            for (size_t i = 0; i < kRays; ++i) {
+                blocked_rays += blocked[i];
+                wrong += (hits[i].triangle >= 0) == (blocked[i] != 0) ? 0U : 1U;
+            }
+        }
+        EXPECT_EQ(wrong, 0U);
+        EXPECT_GT(blocked_rays, kGroups * kRays / 50);
+        EXPECT_LT(blocked_rays, kGroups * kRays - kGroups * kRays / 50);
+    }
+}
+
 /// The path that exactness is priced against takes the same way, and is only seldom wrong.
 TEST(Traversal, PlainPathIsNearlyTheSame) {
     for (const Mesh& mesh : {make_sphere(24, 32), make_room()}) {
