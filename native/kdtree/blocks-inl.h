@@ -34,18 +34,18 @@ HWY_INLINE V longest_side(const V (&corners)[3][3]) {
 HWY_INLINE void prefetch_blocks(const TriangleSoup& soup, const uint32_t* triangles, size_t block, size_t count) {
     constexpr size_t kIndicesAhead = 12;
     constexpr size_t kCornersAhead = 5;
-    const auto lane = [&](size_t b, size_t i) {
+    const auto triangle_or_first = [&](size_t b, size_t i) {
         const uint32_t triangle = triangles[b * kBlockSize + i];
         return triangle == kNoTriangle ? 0 : triangle;
     };
     if (block + kIndicesAhead < count) {
         for (size_t i = 0; i < kBlockSize; ++i) {
-            prefetch_indices(soup, lane(block + kIndicesAhead, i));
+            prefetch_indices(soup, triangle_or_first(block + kIndicesAhead, i));
         }
     }
     if (block + kCornersAhead < count) {
         for (size_t i = 0; i < kBlockSize; i += 2) {  // neighbours share corners
-            prefetch_corner(soup, lane(block + kCornersAhead, i));
+            prefetch_corner(soup, triangle_or_first(block + kCornersAhead, i));
         }
     }
 }

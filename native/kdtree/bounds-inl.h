@@ -54,8 +54,8 @@ inline void make_reference(const TriangleSoup& soup, uint32_t triangle, const Re
     out.triangle[count++] = triangle;
 }
 
-/// The corners of as many faces as there are lanes, of which `first` is one and `end` none. False unless all of them
-/// can be hit for certain.
+/// The corners of as many faces from `first` on as there are lanes; of those further on, up to `end`, some are fetched.
+/// Returns whether all can be hit for certain.
 template <class D, class V = hn::Vec<D>>
 HWY_INLINE bool load_faces(D d, const TriangleSoup& soup, uint32_t first, uint32_t end, V (&v)[3][3]) {
     constexpr uint32_t kLanes = hn::MaxLanes(D());

@@ -155,6 +155,7 @@ Tree build(const TriangleSoup& soup, const BuildOptions& options) {
 }
 
 RejectedFaces rejected_faces(const TriangleSoup& soup, uint32_t begin, uint32_t end) {
+    const FloatEnvironment environment;
     return build_kernels().count_rejected(soup, begin, end);
 }
 

@@ -25,6 +25,7 @@ HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
 namespace hn = hwy::HWY_NAMESPACE;
 
+/// Of a batch, rays that look for any hit.
 class RayGroup {
  public:
     /// Takes in so many of a batch, a bit for each, if they are enough and go into one octant; else returns false.
@@ -89,7 +90,7 @@ class RayGroup {
 
  private:
     static constexpr uint32_t kLeast = 12;  ///< fewer are as fast alone
-    static constexpr int kFew = 4;
+    static constexpr int kFew = 4;          ///< go on sooner alone: a group waits for what it reads, a stream does not
     /// The deepest tree's (see Overflow), and room for one that is not to be visited.
     static constexpr size_t kCapacity = 70 * (WideNode::kWidth - 1) + 2;
 
@@ -103,8 +104,9 @@ class RayGroup {
             for (size_t lane = 0; lane < RayBatch::kSize; lane += hn::Lanes(d)) {
                 BoxSpan<V> span{hn::Load(d, columns_.start + lane), hn::Load(d, columns_.reach + lane)};
                 for (size_t axis = 0; axis < 3; ++axis) {
-                    span.cut(hn::Set(d, planes[near_planes_[axis] + child]), hn::Set(d, planes[far_planes_[axis] + child]),
-                             hn::Load(d, columns_.inverse[axis] + lane), hn::Load(d, columns_.near_shift[axis] + lane),
+                    span.cut(hn::Set(d, planes[near_planes_[axis] + child]),
+                             hn::Set(d, planes[far_planes_[axis] + child]), hn::Load(d, columns_.inverse[axis] + lane),
+                             hn::Load(d, columns_.near_shift[axis] + lane),
                              hn::Load(d, columns_.far_shift[axis] + lane));
                 }
                 entering[child] |= static_cast<uint32_t>(mask_bits(d, span.meets())) << lane;

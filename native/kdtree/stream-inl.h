@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 // Many rays in flight on one thread, each on its own way: while the memory that one needs is fetched, others step.
-// Compiled once per instruction set (see traversal.cpp).
+// Those that look for any hit and set out together go the first part of it as a group. Compiled once per instruction
+// set (see traversal.cpp).
 
 #if defined(ESPALIER_KDTREE_STREAM_INL_H_) == defined(HWY_TARGET_TOGGLE)
 #ifdef ESPALIER_KDTREE_STREAM_INL_H_
@@ -29,11 +30,15 @@ HWY_BEFORE_NAMESPACE();
 namespace espalier::HWY_NAMESPACE {
 namespace hn = hwy::HWY_NAMESPACE;
 
+/// With no more than these waiting, a StreamRay has room for another node's children.
+constexpr size_t kFullStack = 40;
+
 /// What few rays have so much of that it does not fit into StreamRay: the lower part of what they still have to visit.
 /// 70 levels of wide nodes cover the deepest kd-tree, 48 levels if each opens but its siblings, and below it the
-/// longest leaf, kMaxBlocks halved until parts of kMaxLeafBlocks are left.
+/// longest leaf, kMaxBlocks halved until parts of kMaxLeafBlocks are left. A ray that comes from a group may go down so
+/// far with a full stack to begin with.
 struct Overflow {
-    static constexpr size_t kCapacity = 70 * (WideNode::kWidth - 1);
+    static constexpr size_t kCapacity = 70 * (WideNode::kWidth - 1) + kFullStack;
     uint32_t children[kCapacity];
     float depths[kCapacity];
 };
@@ -41,9 +46,8 @@ struct Overflow {
 /// A ray under way with what it still has to visit, what comes first on top, and at the bottom the mark that nothing is
 /// left. Small, since all rays in flight are in use at once: together they are to lie on few pages.
 struct StreamRay : TracedRay {
-    static constexpr uint32_t kNothing = 0;  ///< the root, which is nobody's child
-    static constexpr size_t kFull = 40;      ///< with no more than these there is room for another node's children
-    static constexpr size_t kCapacity = kFull + 2 * WideNode::kWidth;  ///< vectors may run over the end
+    static constexpr uint32_t kNothing = 0;                                 ///< the root, which is nobody's child
+    static constexpr size_t kCapacity = kFullStack + 2 * WideNode::kWidth;  ///< vectors may run over the end
 
     uint32_t number;    ///< among the rays
     uint32_t next;      ///< where it goes: a child's code
@@ -61,7 +65,7 @@ struct StreamRay : TracedRay {
         overflow = 0;
     }
 
-    HWY_INLINE bool is_full() const { return top > children + kFull; }
+    HWY_INLINE bool is_full() const { return top > children + kFullStack; }
 
     /// Moves all but the mark there.
     template <bool kDepths>
@@ -78,7 +82,7 @@ struct StreamRay : TracedRay {
     /// Takes what comes first from there, where there is something, onto an empty stack whose mark was taken off.
     template <bool kDepths>
     HWY_NOINLINE void refill(const Overflow& below) {
-        const uint32_t count = std::min<uint32_t>(overflow, kFull / 2);
+        const uint32_t count = std::min<uint32_t>(overflow, kFullStack / 2);
         overflow -= count;
         std::copy_n(below.children + overflow, count, children + 1);
         top = children + 1 + count;
@@ -308,13 +312,17 @@ class Stream {
         const auto lane = static_cast<uint32_t>(std::countr_zero(waiting_));
         waiting_ &= waiting_ - 1;
         set_out(lane, ray);
-        if (kAnyHit && has_walked_) {
-            // In the order in which the group came by: what comes first on top.
-            const StreamRay& member = members_[lane];
-            ray.top = std::reverse_copy(member.children + 1, static_cast<const uint32_t*>(member.top), ray.top);
-        } else {
-            stack_children<!kAnyHit>(ray, nodes_[0], batch_.root_entries(lane), order());
+        if constexpr (kAnyHit) {
+            if (has_walked_) {
+                // In the order in which the group came by: what comes first on top.
+                const StreamRay& member = members_[lane];
+                ray.top = std::reverse_copy(member.children + 1, static_cast<const uint32_t*>(member.top), ray.top);
+                list(ray, *--ray.top, lists);
+                fetch(ray.next);
+                return;
+            }
         }
+        stack_children<!kAnyHit>(ray, nodes_[0], batch_.root_entries(lane), order());
         // Not fetched: with as many rays going there, it is at hand.
         list(ray, *--ray.top, lists);
     }
@@ -343,10 +351,12 @@ class Stream {
                 batch = filled_up;
             }
             waiting_ = batch_.set_up(batch, nodes_[0]) & ((1U << rays.size()) - 1);
-            has_walked_ = kAnyHit && on_demand_ == nullptr && group_.gather(batch_, waiting_);
-            if (has_walked_) {
-                waiting_ = walk_together(done);
-                continue;
+            if constexpr (kAnyHit) {
+                has_walked_ = on_demand_ == nullptr && group_.gather(batch_, waiting_);
+                if (has_walked_) {
+                    waiting_ = walk_together(done);
+                    continue;
+                }
             }
             waiting_ = root_leaves_.visit(batch_, waiting_,
                                           [&](uint32_t lane, uint32_t place) { done(first_ + lane, place); });

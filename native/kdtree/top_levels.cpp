@@ -64,8 +64,9 @@ TopLevels::TopLevels(const TriangleSoup& soup, const BuildParameters& parameters
       segment_size_(choose_segment_size(soup.size(), threads)),
       transient_(transient),
       memory_(memory_for(soup.size(), segment_size_, threads, transient != nullptr)),
+      first_places_(memory_.first()),
       words_in_use_(std::max(transient == nullptr ? 0 : usual_block_bytes(soup.size()) / sizeof(uint32_t),
-                             memory_.first().words())),
+                             first_places_.words())),
       scratch_(static_cast<size_t>(threads)) {}
 
 void TopLevels::make_references() {
@@ -105,8 +106,8 @@ void TopLevels::make_references() {
     nodes_.push_back(std::move(root));
 }
 
-/// Every thread takes pages of its own: two that first wrote to one page at the same time would both clear it. So do
-/// those that share the few huge pages of a small build's transient memory; of a large one's, many may not be needed.
+/// The few huge pages of a small build's transient memory, which threads share; of a large one's, many may not be
+/// needed.
 size_t TopLevels::transient_pages() const {
     const size_t pages = transient_ == nullptr ? 0 : transient_->huge_pages();
     return pages <= static_cast<size_t>(threads_) ? pages : 0;
@@ -114,13 +115,14 @@ size_t TopLevels::transient_pages() const {
 
 size_t TopLevels::page_count() const { return transient_pages() + words_in_use_ / kPageWords + 1; }
 
+/// Every thread takes pages of its own: two that first wrote to one page at the same time would both clear it.
 void TopLevels::take_page(size_t page) {
     if (page < transient_pages()) {
         transient_->take_huge_page(page);
         return;
     }
     const size_t begin = (page - transient_pages()) * kPageWords;
-    memory_.first().memory().take_pages(begin, std::min(words_in_use_, begin + kPageWords));
+    first_places_.memory().take_pages(begin, std::min(words_in_use_, begin + kPageWords));
 }
 
 /// False if a sample has no plane for that, or if so many faces straddle its planes that they are not worth it.
@@ -163,7 +165,7 @@ Box3f TopLevels::bound_vertices() const {
     return bounds;
 }
 
-/// While one thread does, the others take so many pages.
+/// While one thread plans it, the others take the first so many pages.
 MultiwaySplit TopLevels::choose_multiway_split(const Box3f& bounds, size_t pages) {
     const uint32_t triangles = soup_.size();
     const uint32_t shift = sampling_shift(triangles);

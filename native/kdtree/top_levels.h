@@ -57,7 +57,8 @@ struct UsedReferences {
 /// Phases 1 and 2: the references and the top of the tree, all threads on one level at a time.
 class TopLevels {
  public:
-    /// transient: what subtrees will take, which then, and blocks after them, also lie in the memory of the references.
+    /// transient: what subtrees will take for themselves, whose huge pages are taken as well, if few. Where it is
+    /// given, the memory of the references has room for those of subtrees, and for blocks after them.
     TopLevels(const TriangleSoup& soup, const BuildParameters& parameters, const std::atomic<bool>* cancel, int threads,
               TransientMemory* transient = nullptr);
 
@@ -111,8 +112,9 @@ class TopLevels {
     const uint32_t segment_size_;
     TransientMemory* const transient_;
     SegmentMemory memory_;
-    const size_t words_in_use_;  ///< of that, usually
-    SortedNode root_;            ///< of one leaf, if the scene is not sorted
+    ReferenceBuffer& first_places_;  ///< of that; others may be added while this one is used
+    const size_t words_in_use_;      ///< of those, usually
+    SortedNode root_;                ///< of one leaf, if the scene is not sorted
     std::vector<TopNode> nodes_;
     std::vector<BinCounts> counts_;    ///< per part
     std::vector<References> scratch_;  ///< per thread

@@ -9,6 +9,7 @@
 #include <unordered_map>
 
 #include "geometry/float_environment.h"
+#include "geometry/triangle.h"
 #include "kdtree/parallel.h"
 
 namespace espalier {

@@ -354,60 +354,115 @@ TEST(Traversal, RemembersAllThatWaits) {
     }
 }
 
-/// Rays of a group that have ever more to visit on their own: of sixteen beside each other four pass through seven
-/// boxes at each of 70 nodes below one another. What blocks them lies in the very last of these.
-TEST(Traversal, RaysOfAGroupRememberAllThatWaits) {
-    constexpr uint32_t kLevels = 70;
-    constexpr uint32_t kMissing = kLevels;  // a node with a triangle that no ray meets
-    constexpr uint32_t kMeeting = kLevels + 1;
-    Mesh mesh;
-    mesh.add_triangle({-1, 50, 10}, {4, 50, 10}, {-1, 55, 10});
-    mesh.add_triangle({-1, -1, 10}, {40, -1, 10}, {-1, 40, 10});
-    Tree tree = build(mesh.soup(), {Quality::kBalanced, 1});
-    tree.blocks = LargeBuffer<TriangleBlock>(2);
-    for (uint32_t b = 0; b < 2; ++b) {
-        for (uint32_t lane = 0; lane < kBlockSize; ++lane) {
-            tree.blocks[b].triangle[lane] = lane == 0 ? b : kNoTriangle;
-            for (int corner = 0; corner < 3; ++corner) {
-                for (int axis = 0; axis < 3; ++axis) {
-                    tree.blocks[b].vertex[corner][axis][lane] = lane == 0 ? mesh.soup().vertex(b, corner)[axis] : NAN;
+/// Nodes by hand, over two blocks of one triangle each: the first no ray meets, the second all.
+class HandmadeNodes {
+ public:
+    explicit HandmadeNodes(uint32_t count) {
+        Mesh mesh;
+        mesh.add_triangle({-1, 50, 10}, {4, 50, 10}, {-1, 55, 10});
+        mesh.add_triangle({-1, -1, 10}, {40, -1, 10}, {-1, 40, 10});
+        tree_ = build(mesh.soup(), {Quality::kBalanced, 1});
+        tree_.blocks = LargeBuffer<TriangleBlock>(2);
+        for (uint32_t b = 0; b < 2; ++b) {
+            for (uint32_t lane = 0; lane < kBlockSize; ++lane) {
+                tree_.blocks[b].triangle[lane] = lane == 0 ? b : kNoTriangle;
+                for (int corner = 0; corner < 3; ++corner) {
+                    for (int axis = 0; axis < 3; ++axis) {
+                        tree_.blocks[b].vertex[corner][axis][lane] =
+                            lane == 0 ? mesh.soup().vertex(b, corner)[axis] : NAN;
+                    }
                 }
             }
         }
-    }
-    tree.wide_nodes = LargeBuffer<WideNode>(kLevels + 2);
-    const auto set_child = [&](uint32_t node, uint32_t slot, uint32_t child, float end_of_x) {
-        for (int axis = 0; axis < 3; ++axis) {
-            tree.wide_nodes[node].lower[axis][slot] = -1;
-            tree.wide_nodes[node].upper[axis][slot] = axis == 0 ? end_of_x : 60;
+        tree_.wide_nodes = LargeBuffer<WideNode>(count);
+        for (uint32_t n = 0; n < count; ++n) {
+            for (uint32_t slot = 0; slot < WideNode::kWidth; ++slot) {
+                for (int axis = 0; axis < 3; ++axis) {
+                    tree_.wide_nodes[n].lower[axis][slot] = INFINITY;
+                    tree_.wide_nodes[n].upper[axis][slot] = -INFINITY;
+                }
+                tree_.wide_nodes[n].order[slot] = 076543210U | slot << WideNode::kSoonestShift;  // slot 7 comes first
+            }
         }
-        tree.wide_nodes[node].child[slot] = child;
-    };
-    for (uint32_t n = 0; n < tree.wide_nodes.size(); ++n) {
+    }
+
+    static uint32_t leaf(bool meets) { return WideNode::leaf(meets ? 1 : 0, 1); }
+    void set_child(uint32_t node, uint32_t slot, uint32_t child, float end_of_x) {
+        for (int axis = 0; axis < 3; ++axis) {
+            tree_.wide_nodes[node].lower[axis][slot] = -1;
+            tree_.wide_nodes[node].upper[axis][slot] = axis == 0 ? end_of_x : 60;
+        }
+        tree_.wide_nodes[node].child[slot] = child;
+    }
+    const Tree& tree() const { return tree_; }
+
+    /// Of sixteen rays side by side, at x from 0 to 15.
+    std::vector<uint8_t> blocked() const {
+        std::vector<Ray> rays;
+        for (uint32_t i = 0; i < 16; ++i) {
+            const auto x = static_cast<float>(i);
+            rays.push_back({{x, 0.5F + 0.01F * x, 0}, 0, {0, 0.001F, 1}, INFINITY});
+        }
+        std::vector<uint8_t> blocked(rays.size());
+        occluded(tree_, rays, blocked);
+        return blocked;
+    }
+
+ private:
+    Tree tree_;
+};
+
+constexpr float kAllRays = 40;
+constexpr float kFourRays = 3.5F;
+const std::vector<uint8_t> kFourBlocked{1, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0};
+
+/// Four rays of a group pass through seven boxes at each of 70 nodes below one another that all of it enters: more than
+/// they can take over. What blocks them lies in the very last of these.
+TEST(Traversal, RaysOfAGroupRememberAllThatWaits) {
+    constexpr uint32_t kLevels = 70;
+    constexpr uint32_t kMissing = kLevels;
+    constexpr uint32_t kMeeting = kLevels + 1;
+    HandmadeNodes nodes(kLevels + 2);
+    for (uint32_t n = 0; n < kLevels; ++n) {
         for (uint32_t slot = 0; slot < WideNode::kWidth; ++slot) {
-            for (int axis = 0; axis < 3; ++axis) {
-                tree.wide_nodes[n].lower[axis][slot] = INFINITY;
-                tree.wide_nodes[n].upper[axis][slot] = -INFINITY;
-            }
-            tree.wide_nodes[n].order[slot] = 076543210U | slot << WideNode::kSoonestShift;  // slot 7 comes first
-            if (n < kLevels) {
-                set_child(n, slot, n == 0 && slot == 0 ? kMeeting : kMissing, 3.5F);
-            }
+            nodes.set_child(n, slot, n == 0 && slot == 0 ? kMeeting : kMissing, kFourRays);
         }
         if (n + 1 < kLevels) {
-            set_child(n, WideNode::kWidth - 1, n + 1, 40);
+            nodes.set_child(n, WideNode::kWidth - 1, n + 1, kAllRays);
         }
     }
-    set_child(kMissing, 0, WideNode::leaf(0, 1), 3.5F);
-    set_child(kMeeting, 0, WideNode::leaf(1, 1), 3.5F);
-    std::vector<Ray> rays;
-    for (uint32_t i = 0; i < 16; ++i) {
-        rays.push_back({{static_cast<float>(i), 0.5F + 0.01F * static_cast<float>(i), 0}, 0, {0, 0.001F, 1}, INFINITY});
-    }
-    std::vector<uint8_t> blocked(rays.size());
-    occluded(tree, rays, blocked);
-    for (uint32_t i = 0; i < rays.size(); ++i) {
-        EXPECT_EQ(blocked[i], i < 4 ? 1 : 0) << i;
+    nodes.set_child(kMissing, 0, HandmadeNodes::leaf(false), kFourRays);
+    nodes.set_child(kMeeting, 0, HandmadeNodes::leaf(true), kFourRays);
+    EXPECT_EQ(nodes.blocked(), kFourBlocked);
+}
+
+/// Four rays leave their group with as much as they can take over, and with a way of 68 more nodes, each of which lets
+/// seven more wait, before what blocks them: it lies at that way's very end, or is the last of what they took over.
+TEST(Traversal, RaysThatLeaveAGroupRememberAllThatWaits) {
+    constexpr uint32_t kAbove = 6;  // nodes that all rays enter
+    constexpr uint32_t kDown = 68;
+    constexpr uint32_t kFirst = kAbove;  // of the way down
+    constexpr uint32_t kMissing = kAbove + kDown;
+    constexpr uint32_t kMeeting = kMissing + 1;
+    for (const bool is_at_end : {true, false}) {
+        HandmadeNodes nodes(kMissing + 2);
+        for (uint32_t n = 0; n < kAbove; ++n) {
+            for (uint32_t slot = 0; slot + 1 < WideNode::kWidth; ++slot) {
+                nodes.set_child(n, slot, n == 0 && slot == 0 && !is_at_end ? kMeeting : kMissing, kFourRays);
+            }
+            const bool is_last = n + 1 == kAbove;
+            nodes.set_child(n, WideNode::kWidth - 1, is_last ? kFirst : n + 1, is_last ? kFourRays : kAllRays);
+        }
+        for (uint32_t n = kFirst; n < kFirst + kDown; ++n) {
+            const bool is_last = n + 1 == kFirst + kDown;
+            for (uint32_t slot = 0; slot < WideNode::kWidth; ++slot) {
+                nodes.set_child(n, slot, kMissing, kFourRays);
+            }
+            nodes.set_child(n, WideNode::kWidth - 1, is_last ? (is_at_end ? kMeeting : kMissing) : n + 1, kFourRays);
+        }
+        nodes.set_child(kMissing, 0, HandmadeNodes::leaf(false), kFourRays);
+        nodes.set_child(kMeeting, 0, HandmadeNodes::leaf(true), kFourRays);
+        EXPECT_EQ(nodes.blocked(), kFourBlocked) << is_at_end;
     }
 }
 
