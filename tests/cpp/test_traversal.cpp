@@ -414,7 +414,7 @@ class HandmadeNodes {
 
 constexpr float kAllRays = 40;
 constexpr float kFourRays = 3.5F;
-const std::vector<uint8_t> kFourBlocked{1, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0};
+std::vector<uint8_t> four_blocked() { return {1, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0}; }
 
 /// Four rays of a group pass through seven boxes at each of 70 nodes below one another that all of it enters: more than
 /// they can take over. What blocks them lies in the very last of these.
@@ -433,7 +433,7 @@ TEST(Traversal, RaysOfAGroupRememberAllThatWaits) {
     }
     nodes.set_child(kMissing, 0, HandmadeNodes::leaf(false), kFourRays);
     nodes.set_child(kMeeting, 0, HandmadeNodes::leaf(true), kFourRays);
-    EXPECT_EQ(nodes.blocked(), kFourBlocked);
+    EXPECT_EQ(nodes.blocked(), four_blocked());
 }
 
 /// Four rays leave their group with as much as they can take over, and with a way of 68 more nodes, each of which lets
@@ -462,7 +462,7 @@ TEST(Traversal, RaysThatLeaveAGroupRememberAllThatWaits) {
         }
         nodes.set_child(kMissing, 0, HandmadeNodes::leaf(false), kFourRays);
         nodes.set_child(kMeeting, 0, HandmadeNodes::leaf(true), kFourRays);
-        EXPECT_EQ(nodes.blocked(), kFourBlocked) << is_at_end;
+        EXPECT_EQ(nodes.blocked(), four_blocked()) << is_at_end;
     }
 }
 
