@@ -394,7 +394,6 @@ class HandmadeNodes {
         }
         tree_.wide_nodes[node].child[slot] = child;
     }
-    const Tree& tree() const { return tree_; }
 
     /// Of sixteen rays side by side, at x from 0 to 15.
     std::vector<uint8_t> blocked() const {
