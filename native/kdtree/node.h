@@ -69,6 +69,9 @@ struct alignas(64) WideNode {
     static constexpr int kWidth = 8;
     static constexpr uint32_t kLeafFlag = 0x80000000U;
     static constexpr uint32_t kMaxLeafBlocks = 32;
+    /// Levels of the deepest tree: 48 of the kd-tree if each node opens but its siblings, and below it the longest
+    /// leaf, kMaxBlocks halved until parts of kMaxLeafBlocks are left.
+    static constexpr size_t kMostLevels = 70;
 
     float lower[3][kWidth];  ///< unused lanes hold an inverted box, which no ray meets
     float upper[3][kWidth];

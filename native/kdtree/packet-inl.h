@@ -137,7 +137,7 @@ class Packet {
     static constexpr hn::RebindToUnsigned<D> du{};  // NOLINT(readability-identifier-naming)
     static constexpr size_t kLanes = hn::MaxLanes(D());
     static constexpr auto kLaneBits = static_cast<uint32_t>((uint64_t{1} << kLanes) - 1);
-    static constexpr size_t kCapacity = 70 * (WideNode::kWidth - 1) + 3 * WideNode::kWidth;
+    static constexpr size_t kCapacity = WideNode::kMostLevels * (WideNode::kWidth - 1) + 3 * WideNode::kWidth;
     /// Directions that differ by more are no packet.
     static constexpr float kWidest = 0.125F;
 

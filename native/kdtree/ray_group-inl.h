@@ -91,8 +91,8 @@ class RayGroup {
  private:
     static constexpr uint32_t kLeast = 12;  ///< fewer are as fast alone
     static constexpr int kFew = 4;          ///< go on sooner alone: a group waits for what it reads, a stream does not
-    /// The deepest tree's (see Overflow), and room for one that is not to be visited.
-    static constexpr size_t kCapacity = 70 * (WideNode::kWidth - 1) + 2;
+    /// The deepest tree's, and room for one that is not to be visited.
+    static constexpr size_t kCapacity = WideNode::kMostLevels * (WideNode::kWidth - 1) + 2;
 
     /// For each child the rays that enter it, a bit for each.
     HWY_INLINE void enter(const WideNode& node, uint32_t (&entering)[WideNode::kWidth]) const {

@@ -34,11 +34,9 @@ namespace hn = hwy::HWY_NAMESPACE;
 constexpr size_t kFullStack = 40;
 
 /// What few rays have so much of that it does not fit into StreamRay: the lower part of what they still have to visit.
-/// 70 levels of wide nodes cover the deepest kd-tree, 48 levels if each opens but its siblings, and below it the
-/// longest leaf, kMaxBlocks halved until parts of kMaxLeafBlocks are left. A ray that comes from a group may go down so
-/// far with a full stack to begin with.
+/// A ray that comes from a group may go down the deepest tree with a full stack to begin with.
 struct Overflow {
-    static constexpr size_t kCapacity = 70 * (WideNode::kWidth - 1) + kFullStack;
+    static constexpr size_t kCapacity = WideNode::kMostLevels * (WideNode::kWidth - 1) + kFullStack;
     uint32_t children[kCapacity];
     float depths[kCapacity];
 };
