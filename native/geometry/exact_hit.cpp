@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <iterator>
+#include <limits>
 
 #include "geometry/expansion.h"
 
@@ -36,6 +37,20 @@ Quotient exact_distance(Vec3f origin, Vec3f direction, const Vec3f (&corner)[3])
     return below.sign() < 0 ? Quotient{Expansion() - above, Expansion() - below} : Quotient{above, below};
 }
 
+double largest_of(Vec3d v) { return std::max({std::abs(v.x), std::abs(v.y), std::abs(v.z)}); }
+
+/// Whether all corners have one coordinate in common: what lies in one plane is equally far.
+bool lie_across_an_axis(const Vec3f (&a)[3], const Vec3f (&b)[3]) {
+    for (int axis = 0; axis < 3; ++axis) {
+        const float place = a[0][axis];
+        if (a[1][axis] == place && a[2][axis] == place && b[0][axis] == place && b[1][axis] == place &&
+            b[2][axis] == place) {
+            return true;
+        }
+    }
+    return false;
+}
+
 Side measure_side_exactly(Vec3f origin, Vec3f direction, Vec3f p, Vec3f q) {
     const Expansion side =
         exact_dot(exact(direction), exact_cross(exact_difference(p, origin), exact_difference(q, origin)));
@@ -43,26 +58,11 @@ Side measure_side_exactly(Vec3f origin, Vec3f direction, Vec3f p, Vec3f q) {
     return {value, std::abs(value) * 0x1p-51};
 }
 
-/// The corners' weights, each the edge function of the edge opposite.
-struct Weights {
-    Side side[3];
-    double det = 0;
-    double error = 0;  ///< of det
-
-    void add_up() {
-        det = side[0].value + side[1].value + side[2].value;
-        error = side[0].error + side[1].error + side[2].error;
-    }
-    bool are_open() const {
-        const auto is_open = [](const Side& s) { return std::abs(s.value) <= s.error; };
-        return is_open(side[0]) || is_open(side[1]) || is_open(side[2]) || std::abs(det) < 4 * error;
-    }
-    void place(ExactHit& hit) const {
-        hit.u = side[1].value / det;
-        hit.v = side[2].value / det;
-        hit.place_error = 2 * error / std::abs(det);
-    }
-};
+bool are_open(const Weights& weights) {
+    const auto is_open = [](const Side& s) { return std::abs(s.value) <= s.error; };
+    return is_open(weights.side[0]) || is_open(weights.side[1]) || is_open(weights.side[2]) ||
+           std::abs(weights.det) < 4 * weights.error;
+}
 
 Weights weigh_exactly(Vec3f origin, Vec3f direction, const Vec3f (&corner)[3]) {
     Weights weights;
@@ -90,20 +90,39 @@ Side measure_side(Vec3d d, Vec3d p, Vec3d q) {
     return {d.x * c.x + d.y * c.y + d.z * c.z, size * 0x1p-49};
 }
 
+/// With e = 2^-53 and D, S, A and B the largest components of the direction, of the first corner as seen from the
+/// origin and of the two edges from there, 128 e (S A B + |t| D A B) / |below| covers the errors of both products and
+/// the roundings of t, where |below| is no less than 128 e D A B (EXACTNESS.md, 9).
+Distance distance_to_plane(Vec3f origin, Vec3f direction, const Vec3f (&corner)[3]) {
+    const Vec3d d = to_double(direction);
+    const Vec3d seen = to_double(corner[0]) - to_double(origin);
+    const Vec3d edge[2] = {to_double(corner[1]) - to_double(corner[0]), to_double(corner[2]) - to_double(corner[0])};
+    const Vec3d normal = cross(edge[0], edge[1]);
+    const double below = dot(d, normal);
+    const double area = largest_of(edge[0]) * largest_of(edge[1]);
+    const double size = area * largest_of(d);
+    if (!(std::abs(below) >= size * 0x1p-46)) {
+        return {0, std::numeric_limits<double>::infinity()};
+    }
+    const double scale = 1 / below;
+    const double t = dot(seen, normal) * scale;
+    return {t, 0x1p-46 * (area * largest_of(seen) + std::abs(t) * size) * std::abs(scale)};
+}
+
 bool hit_exactly(Vec3f origin, Vec3f direction, const Vec3f (&corner)[3], ExactHit& hit) {
     const Vec3d d = to_double(direction);
     Vec3d p[3];
     for (int k = 0; k < 3; ++k) {
         p[k] = to_double(corner[k]) - to_double(origin);
     }
-    Weights weights;
+    Weights& weights = hit.weights;
     const auto& side = weights.side;
     for (int k = 0; k < 3; ++k) {
         const Vec3d edge = to_double(corner[(k + 2) % 3]) - to_double(corner[(k + 1) % 3]);
         weights.side[k] = measure_side(d, p[(k + 1) % 3], edge);
     }
     weights.add_up();
-    if (weights.are_open()) {
+    if (are_open(weights)) {
         weights = weigh_exactly(origin, direction, corner);
     }
     const bool any_positive = side[0].value > 0 || side[1].value > 0 || side[2].value > 0;
@@ -111,27 +130,27 @@ bool hit_exactly(Vec3f origin, Vec3f direction, const Vec3f (&corner)[3], ExactH
     if (any_positive == any_negative) {  // on both sides, or in the plane
         return false;
     }
-    weights.place(hit);
     for (int k = 0; k < 3; ++k) {
         hit.corner[k] = corner[k];
     }
     // The weighted mean of the corners along the direction's largest axis. The weights' errors count by the corners'
-    // spread.
+    // spread, and are a quarter of det at most.
     const int axis = largest_component(direction);
     const double z[3] = {p[0][axis], p[1][axis], p[2][axis]};
     const double spread = std::max({z[0], z[1], z[2]}) - std::min({z[0], z[1], z[2]});
     const double size = std::max({std::abs(z[0]), std::abs(z[1]), std::abs(z[2])});
-    const double mean = (side[0].value * z[0] + side[1].value * z[1] + side[2].value * z[2]) / weights.det;
-    const double reach = std::abs(d[axis]);
-    hit.t = mean / d[axis];
-    hit.error = (weights.error * spread / (std::abs(weights.det) - weights.error) + 0x1p-49 * size) / reach;
+    const double scale = 1 / (weights.det * d[axis]);
+    hit.t = (side[0].value * z[0] + side[1].value * z[1] + side[2].value * z[2]) * scale;
+    hit.error = (weights.error * spread * 1.34 + 0x1p-49 * size * std::abs(weights.det)) * std::abs(scale);
     return true;
 }
 
 void finish_hit(Vec3f origin, Vec3f direction, ExactHit& hit) {
-    if (!(hit.place_error <= 0x1p-23)) {
-        weigh_exactly(origin, direction, hit.corner).place(hit);
+    if (std::abs(hit.weights.det) < hit.weights.error * 0x1p24) {
+        hit.weights = weigh_exactly(origin, direction, hit.corner);
     }
+    hit.u = hit.weights.side[1].value / hit.weights.det;
+    hit.v = hit.weights.side[2].value / hit.weights.det;
     if (!(hit.error <= std::abs(hit.t) * 0x1p-28)) {
         const Quotient distance = exact_distance(origin, direction, hit.corner);
         hit.t = distance.above.estimate() / distance.below.estimate();
@@ -139,17 +158,18 @@ void finish_hit(Vec3f origin, Vec3f direction, ExactHit& hit) {
     }
 }
 
-int compare_distance(Vec3f origin, Vec3f direction, const ExactHit& a, const ExactHit& b) {
-    const double margin = 1.0 + 0x1p-50;  // for the rounding of this comparison itself
-    if (std::abs(a.t - b.t) > (a.error + b.error) * margin) {
-        return a.t < b.t ? -1 : 1;
+int compare_distance(Vec3f origin, Vec3f direction, const ExactHit& hit, const Vec3f (&other)[3]) {
+    const Distance there = distance_to_plane(origin, direction, other);
+    if (std::abs(hit.t - there.t) > (hit.error + there.error) * (1 + 0x1p-50)) {
+        return hit.t < there.t ? -1 : 1;
     }
-    if (std::is_permutation(std::begin(a.corner), std::end(a.corner), std::begin(b.corner))) {
-        return 0;  // faces that are there twice
+    if (lie_across_an_axis(hit.corner, other) ||
+        std::is_permutation(std::begin(hit.corner), std::end(hit.corner), std::begin(other))) {
+        return 0;
     }
-    const Quotient x = exact_distance(origin, direction, a.corner);
-    const Quotient y = exact_distance(origin, direction, b.corner);
-    return (x.above * y.below - y.above * x.below).sign();
+    const Quotient a = exact_distance(origin, direction, hit.corner);
+    const Quotient b = exact_distance(origin, direction, other);
+    return (a.above * b.below - b.above * a.below).sign();
 }
 
 int compare_distance(Vec3f origin, Vec3f direction, const ExactHit& hit, float t) {

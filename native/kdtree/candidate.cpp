@@ -9,15 +9,21 @@
 namespace espalier {
 namespace {
 
-bool hit_place(const Ray& ray, const TriangleBlock* blocks, uint32_t place, ExactHit& hit) {
-    const TriangleBlock& block = blocks[place / kBlockSize];
-    const uint32_t lane = place % kBlockSize;
+struct Corners {
     Vec3f corner[3];
-    for (int k = 0; k < 3; ++k) {
-        corner[k] = {block.vertex[k][0][lane], block.vertex[k][1][lane], block.vertex[k][2][lane]};
+
+    Corners(const TriangleBlock* blocks, uint32_t place) {
+        const float* from = corners_at(blocks, place);
+        for (Vec3f& to : corner) {
+            to = {from[0], from[kBlockSize], from[2 * kBlockSize]};
+            from += 3 * kBlockSize;
+        }
     }
+};
+
+bool hit_place(const Ray& ray, const TriangleBlock* blocks, uint32_t place, ExactHit& hit) {
     hit.triangle = static_cast<int32_t>(triangle_at(blocks, place));
-    return hit_exactly(ray.origin, ray.direction, corner, hit);
+    return hit_exactly(ray.origin, ray.direction, Corners(blocks, place).corner, hit);
 }
 
 /// Infinite beyond the largest float, where the language leaves a cast open.
@@ -38,12 +44,10 @@ bool take_exactly(const Ray& ray, const TriangleBlock* blocks, uint32_t place, N
         return false;
     }
     if (nearest.place != kNoPlace) {
-        ExactHit other;
-        if (hit_place(ray, blocks, nearest.place, other)) {
-            const int order = compare_distance(ray.origin, ray.direction, candidate, other);
-            if (order > 0 || (order == 0 && candidate.triangle >= other.triangle)) {
-                return false;
-            }
+        const int order = compare_distance(ray.origin, ray.direction, candidate, Corners(blocks, nearest.place).corner);
+        if (order > 0 ||
+            (order == 0 && candidate.triangle >= static_cast<int32_t>(triangle_at(blocks, nearest.place)))) {
+            return false;
         }
     }
     const double scale = std::max({std::abs(ray.direction.x), std::abs(ray.direction.y), std::abs(ray.direction.z)});

@@ -41,18 +41,10 @@ struct Focus {
     }
 };
 
-/// How far three corners lie together beyond one of the two planes that bound the rays along an axis.
+/// How far three corners lie together to one side of the packet's middle, along an axis; negative if on both.
 template <class V>
-HWY_INLINE V distance_beside(const V (&x)[3], const V (&depth)[3], float spread) {
-    const V wide = hn::Set(hn::DFromV<V>(), spread);
-    V above[3];
-    V below[3];
-    for (size_t k = 0; k < 3; ++k) {
-        above[k] = hn::NegMulAdd(wide, depth[k], x[k]);
-        below[k] = hn::MulAdd(wide, depth[k], x[k]);
-    }
-    return hn::Max(hn::Min(above[0], hn::Min(above[1], above[2])),
-                   hn::Neg(hn::Max(below[0], hn::Max(below[1], below[2]))));
+HWY_INLINE V distance_beside(const V (&x)[3]) {
+    return hn::Max(hn::Min(x[0], hn::Min(x[1], x[2])), hn::Neg(hn::Max(x[0], hn::Max(x[1], x[2]))));
 }
 
 /// What the triangles of a block, or of two, look like from the focus, sheared so that the packet's middle runs along
@@ -138,8 +130,8 @@ struct FocusView {
             const V farthest = hn::Add(hn::Max(corner_depth[0], hn::Max(corner_depth[1], corner_depth[2])), room);
             const auto in_range = hn::And(hn::Le(nearest, hn::Set(d, reach)), hn::Ge(farthest, hn::Set(d, entry)));
             // Small triangles among wide rays are often parted from them by none of their own edges.
-            const V beside = hn::Max(distance_beside(x, corner_depth, focus.spread_x),
-                                     distance_beside(y, corner_depth, focus.spread_y));
+            const V beside = hn::Max(hn::NegMulAdd(hn::Set(d, focus.spread_x), mz, distance_beside(x)),
+                                     hn::NegMulAdd(hn::Set(d, focus.spread_y), mz, distance_beside(y)));
             const auto among = hn::Le(beside, hn::MulAdd(hn::Set(d, 2.0F), margin, hn::Set(d, kTiny)));
             reached |= mask_bits(d, hn::And(hn::And(possible, in_range), among)) << first;
             hn::Store(bound_here, d, bound + first);

@@ -719,6 +719,7 @@ TEST(DoubleBounds, OfSidesAndDistances) {
     Random random(7);
     Share side_share("sides in double, 9");
     Share distance_share("distance in double, 9");
+    Share plane_share("distance to a plane in double, 9");
     Share place_share("u and v over 2^-22.9, 9");
     Share estimate_share("estimate of an expansion, 10");
     uint32_t different = 0;
@@ -743,6 +744,9 @@ TEST(DoubleBounds, OfSidesAndDistances) {
             return;
         }
         distance_share.add(hit.t - truth.t(), hit.error);
+        if (const Distance plane = distance_to_plane(ray.origin, ray.direction, aimed.corner); plane.error < HUGE_VAL) {
+            plane_share.add(plane.t - truth.t(), plane.error);
+        }
         finish_hit(ray.origin, ray.direction, hit);
         place_share.add(hit.u - truth.weight[1] / truth.below, Exact(std::exp2(-22.9)));
         place_share.add(hit.v - truth.weight[2] / truth.below, Exact(std::exp2(-22.9)));
@@ -752,6 +756,8 @@ TEST(DoubleBounds, OfSidesAndDistances) {
     EXPECT_GT(side_share.largest(), 0.05);
     EXPECT_LT(distance_share.largest(), 1);
     EXPECT_GT(distance_share.largest(), 0.02);
+    EXPECT_LT(plane_share.largest(), 1);
+    EXPECT_GT(plane_share.largest(), 0.002);
     EXPECT_LT(place_share.largest(), 1);
 
     // Many parts whose sum nearly cancels.
@@ -790,31 +796,77 @@ TEST(DoubleBounds, LeaveNoComparisonOpen) {
                 Vec3f& corner = other[random.below(3)];
                 corner.x = std::nextafter(corner.x, random.below(2) == 0 ? HUGE_VALF : -HUGE_VALF);
             }
-            ExactHit a;
-            ExactHit b;
+            ExactHit hit;
+            ExactHit of_other;
             if (!has_area(aimed.corner) || !has_area(other) ||
-                !hit_exactly(ray.origin, ray.direction, aimed.corner, a) ||
-                !hit_exactly(ray.origin, ray.direction, other, b)) {
+                !hit_exactly(ray.origin, ray.direction, aimed.corner, hit) ||
+                !hit_exactly(ray.origin, ray.direction, other, of_other)) {
                 continue;
             }
             const Exact t = ExactTriangle(ray, aimed.corner).t();
             const Exact t_other = ExactTriangle(ray, other).t();
-            wrong += compare_distance(ray.origin, ray.direction, a, b) != sgn(Exact(t - t_other)) ? 1U : 0U;
-            close += size_of(t - t_other) <= Exact(a.error) + b.error ? 1U : 0U;
+            wrong += compare_distance(ray.origin, ray.direction, hit, other) != sgn(Exact(t - t_other)) ? 1U : 0U;
+            close += size_of(t - t_other) <= Exact(hit.error) + of_other.error ? 1U : 0U;
             equal += t == t_other ? 1U : 0U;
             auto limit = static_cast<float>(t.get_d());
             for (uint32_t n = random.below(2); n != 0; --n) {
                 limit = std::nextafter(limit, HUGE_VALF);
             }
-            wrong += compare_distance(ray.origin, ray.direction, a, limit) != sgn(Exact(t - limit)) ? 1U : 0U;
-            finish_hit(ray.origin, ray.direction, a);
-            share.add(a.t - t, size_of(t) * Exact(0x1p-27) + Exact(0x1p-1000));
+            wrong += compare_distance(ray.origin, ray.direction, hit, limit) != sgn(Exact(t - limit)) ? 1U : 0U;
+            finish_hit(ray.origin, ray.direction, hit);
+            share.add(hit.t - t, size_of(t) * Exact(0x1p-27) + Exact(0x1p-1000));
         }
     }
     EXPECT_EQ(wrong, 0U);
     EXPECT_GT(close, 500U);
     EXPECT_GT(equal, 500U);
     EXPECT_LT(share.largest(), 1);
+}
+
+/// Triangles across an axis, some of them an ulp apart or one corner off their plane.
+TEST(DoubleBounds, KnowWhatLiesInOnePlane) {
+    Random random(10);
+    uint32_t wrong = 0;
+    uint32_t equal = 0;
+    uint32_t close = 0;
+    const auto centred = [&] { return random.fraction() - 0.5F; };
+    for (int i = 0; i < 9000; ++i) {
+        const int axis = i % 3;
+        Vec3f centre{centred(), centred(), centred()};
+        if (i % 2 == 0) {
+            centre[axis] = 0;  // next to which floats lie closer than double tells
+        }
+        Vec3f corner[2][3];
+        for (auto& triangle : corner) {
+            const Vec3f a{centred(), centred(), centred()};
+            const Vec3f b{centred(), centred(), centred()};
+            const Vec3f from_centre[3] = {a, b, -(a + b)};
+            for (int k = 0; k < 3; ++k) {
+                triangle[k] = centre + from_centre[k];
+                triangle[k][axis] = centre[axis];
+            }
+        }
+        const uint32_t first = random.below(3);
+        for (uint32_t moved = std::array{0U, 1U, 3U}[random.below(3)]; moved != 0; --moved) {
+            float& place = corner[1][(first + moved) % 3][axis];
+            place = std::nextafter(place, random.below(2) == 0 ? HUGE_VALF : -HUGE_VALF);
+        }
+        const Vec3f origin = centre + Vec3f{centred(), centred(), centred()};
+        const Vec3f direction = centre - origin;
+        ExactHit hit;
+        ExactHit other;
+        if (!has_area(corner[0]) || !has_area(corner[1]) || !hit_exactly(origin, direction, corner[0], hit) ||
+            !hit_exactly(origin, direction, corner[1], other)) {
+            continue;
+        }
+        const Ray ray{origin, 0, direction, HUGE_VALF};
+        const int truth = sgn(Exact(ExactTriangle(ray, corner[0]).t() - ExactTriangle(ray, corner[1]).t()));
+        wrong += compare_distance(origin, direction, hit, corner[1]) != truth ? 1U : 0U;
+        (truth == 0 ? equal : close) += 1;
+    }
+    EXPECT_EQ(wrong, 0U);
+    EXPECT_GT(equal, 1000U);
+    EXPECT_GT(close, 1000U);
 }
 
 /// Rays from one point, or to one, beside the edges of one triangle: what packets make of them. Only answers
