@@ -140,8 +140,8 @@ bool hit_exactly(Vec3f origin, Vec3f direction, const Vec3f (&corner)[3], ExactH
     const double spread = std::max({z[0], z[1], z[2]}) - std::min({z[0], z[1], z[2]});
     const double size = std::max({std::abs(z[0]), std::abs(z[1]), std::abs(z[2])});
     const double scale = 1 / (weights.det * d[axis]);
-    hit.t = (side[0].value * z[0] + side[1].value * z[1] + side[2].value * z[2]) * scale;
-    hit.error = (weights.error * spread * 1.34 + 0x1p-49 * size * std::abs(weights.det)) * std::abs(scale);
+    const double t = (side[0].value * z[0] + side[1].value * z[1] + side[2].value * z[2]) * scale;
+    hit.distance = {t, (weights.error * spread * 1.34 + 0x1p-49 * size * std::abs(weights.det)) * std::abs(scale)};
     return true;
 }
 
@@ -151,17 +151,20 @@ void finish_hit(Vec3f origin, Vec3f direction, ExactHit& hit) {
     }
     hit.u = hit.weights.side[1].value / hit.weights.det;
     hit.v = hit.weights.side[2].value / hit.weights.det;
-    if (!(hit.error <= std::abs(hit.t) * 0x1p-28)) {
+    if (!(hit.distance.error <= std::abs(hit.distance.t) * 0x1p-28)) {
         const Quotient distance = exact_distance(origin, direction, hit.corner);
-        hit.t = distance.above.estimate() / distance.below.estimate();
-        hit.error = std::abs(hit.t) * 0x1p-50;
+        const double t = distance.above.estimate() / distance.below.estimate();
+        hit.distance = {t, std::abs(t) * 0x1p-50};
     }
 }
 
 int compare_distance(Vec3f origin, Vec3f direction, const ExactHit& hit, const Vec3f (&other)[3]) {
     const Distance there = distance_to_plane(origin, direction, other);
-    if (std::abs(hit.t - there.t) > (hit.error + there.error) * (1 + 0x1p-50)) {
-        return hit.t < there.t ? -1 : 1;
+    if (hit.distance.is_nearer_than(there)) {
+        return -1;
+    }
+    if (there.is_nearer_than(hit.distance)) {
+        return 1;
     }
     if (lie_across_an_axis(hit.corner, other) ||
         std::is_permutation(std::begin(hit.corner), std::end(hit.corner), std::begin(other))) {
@@ -173,8 +176,11 @@ int compare_distance(Vec3f origin, Vec3f direction, const ExactHit& hit, const V
 }
 
 int compare_distance(Vec3f origin, Vec3f direction, const ExactHit& hit, float t) {
-    if (std::abs(hit.t - t) > hit.error * (1.0 + 0x1p-50)) {
-        return hit.t < t ? -1 : 1;
+    if (hit.distance.is_nearer_than({t, 0})) {
+        return -1;
+    }
+    if (Distance{t, 0}.is_nearer_than(hit.distance)) {
+        return 1;
     }
     const Quotient x = exact_distance(origin, direction, hit.corner);
     return (x.above - Expansion(t) * x.below).sign();

@@ -26,23 +26,25 @@ struct Weights {
     }
 };
 
-/// A triangle that a ray hits, how far along, and where on it.
-struct ExactHit {
+struct Distance {
     double t;
     double error;  ///< more than what t is off by
+
+    /// For certain, with room for the roundings of this comparison itself.
+    bool is_nearer_than(Distance other) const { return other.t - t > (error + other.error) * (1 + 0x1p-50); }
+};
+/// Along the line origin + t direction to the plane of a triangle with an area. The error is infinite where the two are
+/// all but parallel.
+Distance distance_to_plane(Vec3f origin, Vec3f direction, const Vec3f (&corner)[3]);
+
+/// A triangle that a ray hits, how far along, and where on it.
+struct ExactHit {
+    Distance distance;
     Weights weights;
     double u, v;  ///< P = (1 - u - v) corner[0] + u corner[1] + v corner[2]
     Vec3f corner[3];
     int32_t triangle;
 };
-
-struct Distance {
-    double t;
-    double error;  ///< more than what t is off by
-};
-/// Along the line origin + t direction to the plane of a triangle with an area. The error is infinite where the two are
-/// all but parallel.
-Distance distance_to_plane(Vec3f origin, Vec3f direction, const Vec3f (&corner)[3]);
 
 /// Decides as infinite precision would whether the line origin + t direction meets the closed triangle in one point; a
 /// line in the triangle's plane does not. On a hit fills in everything but `triangle`, u and v.

@@ -26,6 +26,10 @@ bool hit_place(const Ray& ray, const TriangleBlock* blocks, uint32_t place, Exac
     return hit_exactly(ray.origin, ray.direction, Corners(blocks, place).corner, hit);
 }
 
+Distance distance_of(const Ray& ray, const TriangleBlock* blocks, uint32_t place) {
+    return distance_to_plane(ray.origin, ray.direction, Corners(blocks, place).corner);
+}
+
 /// Infinite beyond the largest float, where the language leaves a cast open.
 float round_to_float(double t) {
     constexpr double kLargest = std::numeric_limits<float>::max();
@@ -37,6 +41,12 @@ float round_to_float(double t) {
 }  // namespace
 
 bool take_exactly(const Ray& ray, const TriangleBlock* blocks, uint32_t place, Nearest& nearest) {
+    // What a ray starts on, and what lies just behind its nearest hit, is ruled out by its plane alone.
+    const Distance distance = distance_of(ray, blocks, place);
+    if (distance.is_nearer_than({ray.t_min, 0}) || Distance{ray.t_max, 0}.is_nearer_than(distance) ||
+        (nearest.place != kNoPlace && distance_of(ray, blocks, nearest.place).is_nearer_than(distance))) {
+        return false;
+    }
     ExactHit candidate;
     if (!hit_place(ray, blocks, place, candidate) ||
         compare_distance(ray.origin, ray.direction, candidate, ray.t_min) < 0 ||
@@ -51,8 +61,8 @@ bool take_exactly(const Ray& ray, const TriangleBlock* blocks, uint32_t place, N
         }
     }
     const double scale = std::max({std::abs(ray.direction.x), std::abs(ray.direction.y), std::abs(ray.direction.z)});
-    const double lower = (candidate.t - candidate.error) * scale;
-    const double upper = (candidate.t + candidate.error) * scale;
+    const double lower = (candidate.distance.t - candidate.distance.error) * scale;
+    const double upper = (candidate.distance.t + candidate.distance.error) * scale;
     nearest.place = place;
     nearest.lower = round_to_float(lower - std::abs(lower) * 0x1p-22 - 0x1p-120);
     nearest.upper = round_to_float(upper + std::abs(upper) * 0x1p-22 + 0x1p-120);
@@ -65,7 +75,7 @@ Hit finish_exactly(const Ray& ray, const TriangleBlock* blocks, uint32_t place) 
         return missed(ray);
     }
     finish_hit(ray.origin, ray.direction, hit);
-    return {round_to_float(hit.t), static_cast<float>(hit.u), static_cast<float>(hit.v), hit.triangle};
+    return {round_to_float(hit.distance.t), static_cast<float>(hit.u), static_cast<float>(hit.v), hit.triangle};
 }
 
 }  // namespace espalier

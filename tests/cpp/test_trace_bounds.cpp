@@ -743,7 +743,7 @@ TEST(DoubleBounds, OfSidesAndDistances) {
         if (!is_hit) {
             return;
         }
-        distance_share.add(hit.t - truth.t(), hit.error);
+        distance_share.add(hit.distance.t - truth.t(), hit.distance.error);
         if (const Distance plane = distance_to_plane(ray.origin, ray.direction, aimed.corner); plane.error < HUGE_VAL) {
             plane_share.add(plane.t - truth.t(), plane.error);
         }
@@ -806,7 +806,7 @@ TEST(DoubleBounds, LeaveNoComparisonOpen) {
             const Exact t = ExactTriangle(ray, aimed.corner).t();
             const Exact t_other = ExactTriangle(ray, other).t();
             wrong += compare_distance(ray.origin, ray.direction, hit, other) != sgn(Exact(t - t_other)) ? 1U : 0U;
-            close += size_of(t - t_other) <= Exact(hit.error) + of_other.error ? 1U : 0U;
+            close += size_of(t - t_other) <= Exact(hit.distance.error) + of_other.distance.error ? 1U : 0U;
             equal += t == t_other ? 1U : 0U;
             auto limit = static_cast<float>(t.get_d());
             for (uint32_t n = random.below(2); n != 0; --n) {
@@ -814,7 +814,7 @@ TEST(DoubleBounds, LeaveNoComparisonOpen) {
             }
             wrong += compare_distance(ray.origin, ray.direction, hit, limit) != sgn(Exact(t - limit)) ? 1U : 0U;
             finish_hit(ray.origin, ray.direction, hit);
-            share.add(hit.t - t, size_of(t) * Exact(0x1p-27) + Exact(0x1p-1000));
+            share.add(hit.distance.t - t, size_of(t) * Exact(0x1p-27) + Exact(0x1p-1000));
         }
     }
     EXPECT_EQ(wrong, 0U);
