@@ -164,6 +164,40 @@ TEST(Render, LightsReachWhatAnySampleOfThemReaches) {
     }
 }
 
+TEST(Render, AnglesAreWithinTheirErrorAllTheWayRound) {
+    constexpr int kSteps = 4096;
+    for (int i = -kSteps; i <= kSteps; ++i) {
+        const double angle = std::numbers::pi / 4 * i / kSteps;
+        const SineCosine found = sine_cosine(angle);
+        EXPECT_NEAR(found.sine, std::sin(angle), 1e-12);
+        EXPECT_NEAR(found.cosine, std::cos(angle), 1e-12);
+    }
+    for (int i = 0; i < kSteps; ++i) {
+        const double turns = (i + 0.25) / kSteps;
+        const Sample2 place = sample_circle(turns);
+        EXPECT_NEAR(place.x, std::cos(2 * std::numbers::pi * turns), 2e-12);
+        EXPECT_NEAR(place.y, std::sin(2 * std::numbers::pi * turns), 2e-12);
+    }
+}
+
+/// A quarter of the points lies within half the radius, an eighth in each eighth of the turn.
+TEST(Render, DiskIsCoveredEvenly) {
+    constexpr uint32_t kSamples = 4096;
+    uint32_t inner = 0;
+    uint32_t eighth[8] = {};
+    for (uint32_t i = 0; i < kSamples; ++i) {
+        const Sample2 place = sample_disk(sample_2d(i, 11));
+        const double square = place.x * place.x + place.y * place.y;
+        EXPECT_LE(square, 1 + 1e-11);
+        inner += square < 0.25 ? 1 : 0;
+        ++eighth[(place.x < 0 ? 1 : 0) + (place.y < 0 ? 2 : 0) + (std::abs(place.x) < std::abs(place.y) ? 4 : 0)];
+    }
+    EXPECT_NEAR(inner, kSamples / 4, 16);
+    for (const uint32_t count : eighth) {
+        EXPECT_NEAR(count, kSamples / 8, 16);
+    }
+}
+
 TEST(Render, DirectionsFollowTheirDensity) {
     Random random;
     for (int i = 0; i < 20; ++i) {
