@@ -274,9 +274,17 @@ class Stream {
     /// So many that, with what is noted of them and fetched for them, they fit into a processor's first cache of 32
     /// KiB.
     static constexpr uint32_t kInFlight = 24;
-    /// Nodes and blocks that take no more bytes are so near that fetching ahead costs more than it gains. Where steps
-    /// take two blocks measured with an L2 cache of 1 MiB only.
-    static size_t near_bytes() { return kBlocksPerStep == 2 ? size_t{10} << 20 : 4 * l2_cache_bytes(); }
+    /// Nodes and blocks that take no more bytes are so near that fetching ahead costs more than it gains: a few times
+    /// the L2 cache where the L3 cache is near, and little more than it where it is not, in processors whose L2 cache
+    /// makes up for that (OPTIMIZATION.md).
+    static size_t near_bytes() {
+        constexpr size_t kMiB = size_t{1} << 20;
+        const size_t l2 = l2_cache_bytes();
+        if (l2 >= 2 * kMiB) {
+            return l2 + l2 / 2;
+        }
+        return kBlocksPerStep == 2 ? 10 * kMiB : 4 * l2;
+    }
     /// Lines of 64 bytes that are fetched of a node, and of a leaf from where a ray goes on, of whose blocks each has
     /// five.
     static constexpr size_t kLinesOfNode = sizeof(WideNode) / 64;
