@@ -39,7 +39,7 @@ Quotient exact_distance(Vec3f origin, Vec3f direction, const Vec3f (&corner)[3])
 
 double largest_of(Vec3d v) { return std::max({std::abs(v.x), std::abs(v.y), std::abs(v.z)}); }
 
-/// Whether all corners have one coordinate in common: what lies in one plane is equally far.
+/// Whether all corners have one coordinate in common: what lies in one plane is equally far for a ray that hits both.
 bool lie_across_an_axis(const Vec3f (&a)[3], const Vec3f (&b)[3]) {
     for (int axis = 0; axis < 3; ++axis) {
         const float place = a[0][axis];

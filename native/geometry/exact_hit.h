@@ -26,6 +26,7 @@ struct Weights {
     }
 };
 
+/// How far along a ray, as double has it.
 struct Distance {
     double t;
     double error;  ///< more than what t is off by

@@ -41,7 +41,7 @@ float round_to_float(double t) {
 }  // namespace
 
 bool take_exactly(const Ray& ray, const TriangleBlock* blocks, uint32_t place, Nearest& nearest) {
-    // What a ray starts on, and what lies just behind its nearest hit, is ruled out by its plane alone.
+    // What a ray starts on, and what lies just behind its end or its nearest hit, is ruled out by its plane alone.
     const Distance distance = distance_of(ray, blocks, place);
     if (distance.is_nearer_than({ray.t_min, 0}) || Distance{ray.t_max, 0}.is_nearer_than(distance) ||
         (nearest.place != kNoPlace && distance_of(ray, blocks, nearest.place).is_nearer_than(distance))) {

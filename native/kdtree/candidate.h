@@ -25,7 +25,7 @@ inline const float* corners_at(const TriangleBlock* blocks, uint32_t place) {
 }
 
 /// The triangle at `place` takes the nearest's if exact arithmetic says that the ray hits it within its interval, and
-/// nearer than the other, or as near with a lower index. Returns whether it did.
+/// nearer than the other, which the ray truly hits, or as near with a lower index. Returns whether it did.
 bool take_exactly(const Ray& ray, const TriangleBlock* blocks, uint32_t place, Nearest& nearest);
 
 /// The hit of a ray with the triangle at `place`, which it is known to hit.

@@ -58,13 +58,13 @@ struct FocusView {
     alignas(64) float size[kSize];          ///< the largest |depth|
 
     /// Fills all in. Returns the lanes that a ray of the packet may meet at depths from `entry` to `reach`, if its
-    /// slopes are any that the packet's may be: those that neither an edge nor a plane that bounds the rays parts from
-    /// them.
+    /// slopes are any that the packet's may be: those that neither an edge parts from the rays nor how far these reach
+    /// to the side where a triangle is farthest.
     ///
     /// Edges are differences of corners as they are given, so that errors count by the edge and not by what lies
     /// between it and the packet's middle. With u = 2^-24, E the sum of the edges' largest sizes along x, y and z,
     /// m = mx + my, and g = (spread_x + spread_y) mz, an edge function is off by at most u E (13.6 m + 4 slope mz + 11
-    /// g), and by 1.25 deviation E for lines that miss the focus; a corner's distance from a bounding plane by no more
+    /// g), and by 1.25 deviation E for lines that miss the focus; how far a corner lies beyond that reach by no more
     /// than that less E. Subnormal edges, whose errors are not so small, count as 2^-120. EXACTNESS.md, 8.
     HWY_INLINE uint32_t look(const Focus& focus, const BlockLoader& load, float entry, float reach) {
         const hn::CappedTag<float, kSize> d;

@@ -41,8 +41,8 @@ struct SineCosine {
     double sine, cosine;
 };
 
-/// Of an angle of at most pi / 4, by Taylor's series, each off by less than 1e-12. The same bits everywhere, which the
-/// system's functions do not promise, and in a fraction of their time.
+/// Of an angle of at most pi / 4 in size, by Taylor's series, each off by less than 1e-12. The same bits everywhere,
+/// which the system's functions do not promise, and in a fraction of their time.
 inline SineCosine sine_cosine(double angle) {
     const double square = angle * angle;
     double sine = 0.0;

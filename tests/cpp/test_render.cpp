@@ -192,9 +192,9 @@ TEST(Render, DiskIsCoveredEvenly) {
         inner += square < 0.25 ? 1 : 0;
         ++eighth[(place.x < 0 ? 1 : 0) + (place.y < 0 ? 2 : 0) + (std::abs(place.x) < std::abs(place.y) ? 4 : 0)];
     }
-    EXPECT_NEAR(inner, kSamples / 4, 16);
+    EXPECT_NEAR(inner, kSamples * 0.25, 16);
     for (const uint32_t count : eighth) {
-        EXPECT_NEAR(count, kSamples / 8, 16);
+        EXPECT_NEAR(count, kSamples * 0.125, 16);
     }
 }
 
