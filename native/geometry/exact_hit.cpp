@@ -37,7 +37,8 @@ Quotient exact_distance(Vec3f origin, Vec3f direction, const Vec3f (&corner)[3])
     return below.sign() < 0 ? Quotient{Expansion() - above, Expansion() - below} : Quotient{above, below};
 }
 
-double largest_of(Vec3d v) { return std::max({std::abs(v.x), std::abs(v.y), std::abs(v.z)}); }
+/// -1 or 1 where one distance is the smaller for certain, else 0.
+int order_of(Distance a, Distance b) { return (b.is_nearer_than(a) ? 1 : 0) - (a.is_nearer_than(b) ? 1 : 0); }
 
 /// Whether all corners have one coordinate in common: what lies in one plane is equally far for a ray that hits both.
 bool lie_across_an_axis(const Vec3f (&a)[3], const Vec3f (&b)[3]) {
@@ -134,7 +135,7 @@ bool hit_exactly(Vec3f origin, Vec3f direction, const Vec3f (&corner)[3], ExactH
         hit.corner[k] = corner[k];
     }
     // The weighted mean of the corners along the direction's largest axis. The weights' errors count by the corners'
-    // spread, and are a quarter of det at most.
+    // spread.
     const int axis = largest_component(direction);
     const double z[3] = {p[0][axis], p[1][axis], p[2][axis]};
     const double spread = std::max({z[0], z[1], z[2]}) - std::min({z[0], z[1], z[2]});
@@ -159,12 +160,8 @@ void finish_hit(Vec3f origin, Vec3f direction, ExactHit& hit) {
 }
 
 int compare_distance(Vec3f origin, Vec3f direction, const ExactHit& hit, const Vec3f (&other)[3]) {
-    const Distance there = distance_to_plane(origin, direction, other);
-    if (hit.distance.is_nearer_than(there)) {
-        return -1;
-    }
-    if (there.is_nearer_than(hit.distance)) {
-        return 1;
+    if (const int order = order_of(hit.distance, distance_to_plane(origin, direction, other)); order != 0) {
+        return order;
     }
     if (lie_across_an_axis(hit.corner, other) ||
         std::is_permutation(std::begin(hit.corner), std::end(hit.corner), std::begin(other))) {
@@ -176,11 +173,8 @@ int compare_distance(Vec3f origin, Vec3f direction, const ExactHit& hit, const V
 }
 
 int compare_distance(Vec3f origin, Vec3f direction, const ExactHit& hit, float t) {
-    if (hit.distance.is_nearer_than({t, 0})) {
-        return -1;
-    }
-    if (Distance{t, 0}.is_nearer_than(hit.distance)) {
-        return 1;
+    if (const int order = order_of(hit.distance, {t, 0}); order != 0) {
+        return order;
     }
     const Quotient x = exact_distance(origin, direction, hit.corner);
     return (x.above - Expansion(t) * x.below).sign();

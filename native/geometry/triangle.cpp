@@ -41,7 +41,7 @@ FaceFault classify_face(Vec3f v0, Vec3f v1, Vec3f v2) {
         return FaceFault::kNotFinite;
     }
     for (const Vec3f& v : {v0, v1, v2}) {
-        if (std::max({std::abs(v.x), std::abs(v.y), std::abs(v.z)}) > kMaxCoordinate) {
+        if (largest_of(v) > kMaxCoordinate) {
             return FaceFault::kTooLarge;
         }
     }

@@ -54,6 +54,12 @@ bool is_finite(Vec3<T> a) {
     return std::isfinite(a.x) && std::isfinite(a.y) && std::isfinite(a.z);
 }
 
+/// The largest of the components' sizes.
+template <class T>
+T largest_of(Vec3<T> a) {
+    return std::max({std::abs(a.x), std::abs(a.y), std::abs(a.z)});
+}
+
 constexpr Vec3d to_double(Vec3f a) { return {a.x, a.y, a.z}; }
 
 /// Rounds each component once.

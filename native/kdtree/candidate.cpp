@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 #include "kdtree/candidate.h"
 
-#include <algorithm>
 #include <cmath>
 
 #include "geometry/exact_hit.h"
@@ -60,7 +59,7 @@ bool take_exactly(const Ray& ray, const TriangleBlock* blocks, uint32_t place, N
             return false;
         }
     }
-    const double scale = std::max({std::abs(ray.direction.x), std::abs(ray.direction.y), std::abs(ray.direction.z)});
+    const double scale = largest_of(ray.direction);
     const double lower = (candidate.distance.t - candidate.distance.error) * scale;
     const double upper = (candidate.distance.t + candidate.distance.error) * scale;
     nearest.place = place;

@@ -320,10 +320,7 @@ class Packet {
         Vec3f deviation;
 
         HWY_INLINE Slabs(const Packet& packet, Vec3f f, Vec3f off)
-            : extent(packet.extent_),
-              farthest(hn::Set(d, extent + std::max({std::abs(f.x), std::abs(f.y), std::abs(f.z)}))),
-              focus(f),
-              deviation(off) {}
+            : extent(packet.extent_), farthest(hn::Set(d, extent + largest_of(f))), focus(f), deviation(off) {}
 
         HWY_INLINE Slab<V> slab(const Way& way, int axis, V steepness) const {
             const auto negative = hn::Lt(hn::Set(d, way.towards[axis]), hn::Zero(d));

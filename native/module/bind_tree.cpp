@@ -158,17 +158,15 @@ class RayInput {
         return packer.all_sound();
     }
 
-    static float largest_component(Vec3f v) { return std::max({std::abs(v.x), std::abs(v.y), std::abs(v.z)}); }
-
     /// What is wrong with a ray; nullptr if it is sound.
     static const char* fault(const Ray& ray) {
         if (!is_finite(ray.origin))
             return "origins is not finite";
-        if (largest_component(ray.origin) > kMaxCoordinate)
+        if (largest_of(ray.origin) > kMaxCoordinate)
             return "origins must not lie beyond 2^60";
         if (!is_finite(ray.direction))
             return "directions is not finite";
-        const float size = largest_component(ray.direction);
+        const float size = largest_of(ray.direction);
         if (size == 0.0F)
             return "directions is zero";
         if (size < kShortest || size > kLongest)

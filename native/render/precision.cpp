@@ -18,7 +18,7 @@ Vec3d load(std::span<const float> xyz, size_t index) {
 
 /// Not a number where a ray can never meet the point.
 double largest_component(Vec3d p) {
-    const double largest = is_finite(p) ? std::max({std::abs(p.x), std::abs(p.y), std::abs(p.z)}) : HUGE_VAL;
+    const double largest = is_finite(p) ? largest_of(p) : HUGE_VAL;
     return largest <= kMaxCoordinate ? largest : std::numeric_limits<double>::quiet_NaN();
 }
 

@@ -42,8 +42,6 @@ Vec3d load(std::span<const float> xyz, size_t index) {
     return {xyz[3 * index], xyz[3 * index + 1], xyz[3 * index + 2]};
 }
 
-double largest_component(Vec3d p) { return std::max({std::abs(p.x), std::abs(p.y), std::abs(p.z)}); }
-
 /// How much longer edges of all directions become, in the mean of the squares.
 double mean_scale(const Matrix4& matrix) {
     double sum = 0.0;
@@ -190,7 +188,7 @@ void Scene::place(std::span<const MeshInput> meshes, std::span<const Placement> 
         bounds.add(part);
     if (bounds.lower.x <= bounds.upper.x) {
         centre_ = bounds.lower * 0.5 + bounds.upper * 0.5;
-        precision_.distance = 0.5 * largest_component(bounds.upper - bounds.lower);
+        precision_.distance = 0.5 * largest_of(bounds.upper - bounds.lower);
     }
 
     parallel_for(threads, vertex_chunks.size(), [&](size_t c) {
@@ -269,7 +267,7 @@ void Scene::measure_precision(std::span<const MeshInput> meshes, std::span<const
         keep_worse(object.in_scene, precision_at(distances[p], own.edge));
         const Vec3d at = placements[p].matrix.translation();
         if (to_double(to_float(at)) == at)
-            keep_worse(object.in_placement, precision_at(largest_component(at), own.edge));
+            keep_worse(object.in_placement, precision_at(largest_of(at), own.edge));
     }
 }
 

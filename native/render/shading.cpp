@@ -8,8 +8,6 @@
 namespace espalier {
 namespace {
 
-double largest(Vec3d v) { return std::max({std::abs(v.x), std::abs(v.y), std::abs(v.z)}); }
-
 /// A point that lies, once rounded to float, on the outer side of the triangle that `point` was lifted from.
 Vec3f lift_off(const SurfacePoint& surface, Vec3d point) {
     const Vec3d normal = surface.geometric_normal;
@@ -24,7 +22,7 @@ Vec3f lift_off(const SurfacePoint& surface, Vec3d point) {
 std::optional<Ray> lift_ray(const SurfacePoint& surface) {
     const Vec3f start = lift_off(surface, surface.position);
     const Vec3f way = lift_off(surface, surface.position + surface.shadow_lift) - start;
-    if (largest(to_double(way)) < 0x1p-100)
+    if (largest_of(to_double(way)) < 0x1p-100)
         return std::nullopt;
     return Ray{start, 0.0F, way, 1.0F};
 }
@@ -37,7 +35,7 @@ Ray shadow_ray(const SurfacePoint& surface, const LightSample& sample) {
 
     // The end is drawn back by more than the error of a hit, so that a lamp in a surface is not hidden by that surface.
     const Vec3d end = surface.position + sample.to_light;
-    const double end_error = (largest(end) + largest(lifted)) * 0x1p-20 / length(sample.to_light);
+    const double end_error = (largest_of(end) + largest_of(lifted)) * 0x1p-20 / length(sample.to_light);
     return {start, 0.0F, to_float(end - to_double(start)), static_cast<float>(std::max(0.0, 1.0 - end_error))};
 }
 
