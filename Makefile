@@ -61,7 +61,7 @@ test-neon: python
 	qemu-aarch64 -L /usr/aarch64-linux-gnu build/neon/espalier_fingerprint >build/neon/fingerprint
 	for set in $$(build/release/espalier_fingerprint sets); do \
 		ESPALIER_SIMD=$$set build/release/espalier_fingerprint | diff - build/neon/fingerprint || exit; \
-		echo "The same trees and the same hits on $$set and on neon"; done
+		echo "The same trees, hits and light samples on $$set and on neon"; done
 
 package: build/package.stamp
 build/package.stamp: $(NATIVE) $(ADDON) tools/package.py | native

@@ -6,12 +6,12 @@
 #include <chrono>
 #include <cmath>
 #include <limits>
-#include <numbers>
 #include <vector>
 
 #include "geometry/float_environment.h"
 #include "kdtree/parallel.h"
 #include "kdtree/traversal.h"
+#include "render/light_rays.h"
 #include "render/shading.h"
 
 namespace espalier {
@@ -61,7 +61,7 @@ class TileTracer {
         for (int first = 0; first < settings_.samples; first += kSamplesPerBatch) {
             trace_primary(film, first, std::min(first + kSamplesPerBatch, settings_.samples));
             for (size_t light = 0; light < lights_.size(); ++light)
-                trace_light(film, light);
+                trace_light(light);
         }
         for (const PixelSum& pixel : pixels_) {
             const Vec3f color = to_float(pixel.radiance / settings_.samples);
@@ -77,20 +77,20 @@ class TileTracer {
             throw RenderCancelled();
     }
 
-    /// Dimension 0 moves the primary ray within its pixel, dimension 1 + i samples light i.
-    Sample2 random(const Film& film, const PixelSum& pixel, uint32_t sample, uint32_t dimension) const {
-        const auto index =
-            static_cast<uint32_t>(pixel.y) * static_cast<uint32_t>(film.width()) + static_cast<uint32_t>(pixel.x);
-        return sample_2d(sample, hash_bits(index, dimension));
+    /// Dimension 0 of a pixel's samples moves the primary ray within it, dimension 1 + i samples light i.
+    static uint32_t index_of(const Film& film, const PixelSum& pixel) {
+        return static_cast<uint32_t>(pixel.y) * static_cast<uint32_t>(film.width()) + static_cast<uint32_t>(pixel.x);
     }
 
     void trace_primary(const Film& film, int first_sample, int end_sample) {
         stop_if_cancelled();
         rays_.clear();
         for (int sample = first_sample; sample < end_sample; ++sample) {
+            const SequencePoint sequence = sequence_point(static_cast<uint32_t>(sample));
             for (const PixelSum& pixel : pixels_) {
-                const Sample2 offset =
-                    settings_.samples == 1 ? Sample2{0.5, 0.5} : random(film, pixel, static_cast<uint32_t>(sample), 0);
+                const Sample2 offset = settings_.samples == 1
+                                           ? Sample2{0.5, 0.5}
+                                           : scrambled(sequence, hash_bits(index_of(film, pixel) ^ dimension_key(0)));
                 rays_.push_back(camera_.ray((pixel.x + offset.x) / film.width(), (pixel.y + offset.y) / film.height()));
             }
         }
@@ -110,6 +110,9 @@ class TileTracer {
                  pixel, static_cast<uint32_t>(first_sample) + static_cast<uint32_t>(i / pixels_.size())});
         }
         drop_blocked_lifts();
+        points_.clear();
+        for (const Shade& shade : shades_)
+            points_.add(shade.surface, index_of(film, pixels_[shade.pixel]), sequence_point(shade.sample), shade.pixel);
     }
 
     void drop_blocked_lifts() {
@@ -129,41 +132,22 @@ class TileTracer {
         }
     }
 
-    void trace_light(const Film& film, size_t index) {
+    void trace_light(size_t index) {
         stop_if_cancelled();
         const Light& light = lights_[index];
-        rays_.clear();
-        arrivals_.clear();
-        for (const Shade& shade : shades_) {
-            PixelSum& pixel = pixels_[shade.pixel];
-            const SurfacePoint& surface = shade.surface;
-            if (!light.may_reach(surface.position, surface.shading_normal))
-                continue;
-            const auto sample = light.sample(surface.position, surface.shading_normal,
-                                             random(film, pixel, shade.sample, 1 + static_cast<uint32_t>(index)));
-            if (!sample)
-                continue;
-            const Vec3d reflected = to_double(surface.base_color) * sample->irradiance * (1.0 / std::numbers::pi);
-            if (!light.casts_shadow()) {
-                pixel.radiance += reflected;
-                continue;
-            }
-            rays_.push_back(shadow_ray(surface, *sample));
-            arrivals_.push_back({shade.pixel, reflected});
+        rays_.resize(points_.size);
+        arrivals_.resize(points_.size);
+        const size_t count = light_rays(light, points_, 1 + static_cast<uint32_t>(index), rays_, arrivals_);
+        blocked_.assign(count, 0);
+        if (light.shadow) {
+            shadow_rays_ += count;
+            occluded(tree_, std::span(rays_).first(count), blocked_);
         }
-        shadow_rays_ += rays_.size();
-        blocked_.resize(rays_.size());
-        occluded(tree_, rays_, blocked_);
-        for (size_t i = 0; i < rays_.size(); ++i) {
+        for (size_t i = 0; i < count; ++i) {
             if (blocked_[i] == 0)
-                pixels_[arrivals_[i].pixel].radiance += arrivals_[i].radiance;
+                pixels_[arrivals_[i].target].radiance += arrivals_[i].radiance;
         }
     }
-
-    struct Arrival {
-        uint32_t pixel;
-        Vec3d radiance;
-    };
 
     const Scene& scene_;
     const Tree& tree_;
@@ -175,6 +159,7 @@ class TileTracer {
     std::vector<Ray> rays_;
     std::vector<Hit> hits_;
     std::vector<Shade> shades_;
+    LitPoints points_;
     std::vector<Arrival> arrivals_;
     std::vector<uint8_t> blocked_;
     uint64_t shadow_rays_ = 0;

@@ -1,9 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 #include "render/shading.h"
 
-#include <algorithm>
 #include <cmath>
-#include <limits>
 
 namespace espalier {
 namespace {
@@ -27,16 +25,8 @@ std::optional<Ray> lift_ray(const SurfacePoint& surface) {
     return Ray{start, 0.0F, way, 1.0F};
 }
 
-Ray shadow_ray(const SurfacePoint& surface, const LightSample& sample) {
-    const Vec3d lifted = surface.position + surface.shadow_lift;
-    const Vec3f start = lift_off(surface, lifted);
-    if (sample.distant)
-        return {start, 0.0F, to_float(sample.to_light), std::numeric_limits<float>::infinity()};
-
-    // The end is drawn back by more than the error of a hit, so that a lamp in a surface is not hidden by that surface.
-    const Vec3d end = surface.position + sample.to_light;
-    const double end_error = (largest_of(end) + largest_of(lifted)) * 0x1p-20 / length(sample.to_light);
-    return {start, 0.0F, to_float(end - to_double(start)), static_cast<float>(std::max(0.0, 1.0 - end_error))};
+Vec3f shadow_ray_start(const SurfacePoint& surface) {
+    return lift_off(surface, surface.position + surface.shadow_lift);
 }
 
 }  // namespace espalier

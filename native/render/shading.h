@@ -4,7 +4,6 @@
 #include <optional>
 
 #include "kdtree/traversal.h"
-#include "render/light.h"
 #include "render/scene.h"
 
 namespace espalier {
@@ -13,9 +12,8 @@ namespace espalier {
 /// between the two, and the surface's lift has to go. None where there is no lift to speak of.
 std::optional<Ray> lift_ray(const SurfacePoint& surface);
 
-/// The ray from a surface to a light sample; if it is blocked, the light does not arrive. It starts strictly on the
-/// side to which the geometric normal points, as near to the surface as float coordinates allow, so it never meets the
-/// face it starts on.
-Ray shadow_ray(const SurfacePoint& surface, const LightSample& sample);
+/// Where shadow rays start: strictly on the side to which the geometric normal points, as near to the surface as float
+/// coordinates allow.
+Vec3f shadow_ray_start(const SurfacePoint& surface);
 
 }  // namespace espalier

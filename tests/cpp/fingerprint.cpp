@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// Prints checksums of trees and of hits, to be compared between machines and instruction sets: all must be the same.
-// With the argument "sets" prints the instruction sets that this machine runs instead.
+// Prints checksums of trees, of hits and of light samples, to be compared between machines and instruction sets: all
+// must be the same. With the argument "sets" prints the instruction sets that this machine runs instead.
 
 #include <cstdio>
 #include <cstring>
@@ -9,6 +9,7 @@
 #include "kdtree/simd_target.h"
 #include "meshes.h"
 #include "rays.h"
+#include "render/light_rays.h"
 
 namespace espalier {
 namespace {
@@ -74,6 +75,55 @@ void print_fingerprint(const char* name, const Mesh& mesh) {
     std::printf("\n");
 }
 
+/// A light that all points lie around. Its angles have cosines that are given: the system's are not the same
+/// everywhere.
+Light make_light(LightKind kind, AreaShape shape) {
+    LightInput input;
+    input.kind = kind;
+    input.shape = shape;
+    input.energy = 3.0;
+    input.radius = 0.25;
+    input.size = 1.5;
+    input.size_y = 0.5;
+    input.matrix.rows = {
+        {{0.6, 0.0, 0.8, 0.125}, {0.0, 1.0, 0.0, -0.25}, {-0.8, 0.0, 0.6, 0.375}, {0.0, 0.0, 0.0, 1.0}}};
+    Light light(input, {0.0, 0.0, 0.0});
+    light.cos_half = 0.375;
+    light.spot_fade = 0.25;
+    return light;
+}
+
+void print_light_rays() {
+    const Mesh sphere = make_sphere(30, 45);
+    LitPoints points;
+    for (uint32_t i = 0; 3 * size_t{i} + 2 < sphere.positions.size(); ++i) {
+        SurfacePoint surface{};
+        surface.position = {sphere.positions[3 * i], sphere.positions[3 * i + 1], sphere.positions[3 * i + 2]};
+        surface.geometric_normal = surface.shading_normal = surface.position * -1.0;
+        surface.base_color = {0.5F, 0.25F, 1.0F};
+        points.add(surface, i, sequence_point(i % 4), i);
+    }
+    const Light lights[] = {make_light(LightKind::kPoint, {}),
+                            make_light(LightKind::kSpot, {}),
+                            make_light(LightKind::kSun, {}),
+                            make_light(LightKind::kArea, AreaShape::kRectangle),
+                            make_light(LightKind::kArea, AreaShape::kEllipse),
+                            Light::sky({1.0, 2.0, 3.0}, {0.5, 0.25, 0.0})};
+    std::vector<Ray> rays(points.size);
+    std::vector<Arrival> arrivals(points.size);
+    std::printf("light rays");
+    for (const Light& light : lights) {
+        const size_t count = light_rays(light, points, 3, rays, arrivals);
+        Checksum samples;
+        samples.add(rays.data(), count);
+        for (size_t i = 0; i < count; ++i) {
+            samples.add(&arrivals[i].target, 1).add(&arrivals[i].radiance, 1);
+        }
+        std::printf(" | %zu %016llx", count, samples.value());
+    }
+    std::printf("\n");
+}
+
 void print_all() {
     print_fingerprint("sphere", make_sphere(60, 90));
     print_fingerprint("far sphere", moved(make_sphere(30, 40), 1e5F, 1));
@@ -85,6 +135,7 @@ void print_all() {
     print_fingerprint("grid", make_grid(25));
     print_fingerprint("large grid", make_grid(256));
     print_fingerprint("faulty", make_faulty());
+    print_light_rays();
 }
 
 }  // namespace

@@ -2,14 +2,11 @@
 #include <gtest/gtest.h>
 
 #include <cmath>
-#include <map>
-#include <numbers>
 #include <random>
 #include <set>
 
 #include "render/camera.h"
 #include "render/film.h"
-#include "render/light.h"
 #include "render/render.h"
 #include "render/sampling.h"
 #include "render/scene.h"
@@ -65,28 +62,15 @@ TEST(Render, ShadowRaysStartStrictlyOnTheirSideAndNear) {
         EXPECT_LE(dot(surface.geometric_normal, direction), 0.0) << "the normal faces the ray";
         EXPECT_NEAR(length(surface.geometric_normal), 1.0, 1e-12);
 
-        const Ray ray = shadow_ray(surface, {surface.geometric_normal, true, {}});
+        const Vec3f start = shadow_ray_start(surface);
         const TriangleSoup soup = scene.soup();
         const Vec3f a = soup.vertex(0, 0), b = soup.vertex(0, 1), c = soup.vertex(0, 2);
         const Vec3d wound = cross(to_double(b) - to_double(a), to_double(c) - to_double(a));
         const bool front = dot(wound, surface.geometric_normal) > 0;
-        EXPECT_GT(front ? side_of_plane(ray.origin, a, b, c) : -side_of_plane(ray.origin, a, b, c), 0.0L);
-        const double away = length(to_double(ray.origin) - surface.position);
+        EXPECT_GT(front ? side_of_plane(start, a, b, c) : -side_of_plane(start, a, b, c), 0.0L);
+        const double away = length(to_double(start) - surface.position);
         EXPECT_LE(away, 4e-7 * (length(surface.position) + surface.error * 0x1p24));
     }
-}
-
-TEST(Render, NearbyLightsAreReachedNotPassed) {
-    SurfacePoint surface{};
-    surface.position = {10.0, 20.0, 30.0};
-    surface.geometric_normal = surface.shading_normal = {0.0, 0.0, 1.0};
-    const Ray ray = shadow_ray(surface, {{1.0, 2.0, 3.0}, false, {}});
-    EXPECT_EQ(ray.t_min, 0.0F);
-    EXPECT_LT(ray.t_max, 1.0F);
-    EXPECT_GT(ray.t_max, 0.9999F);
-    EXPECT_NEAR(ray.origin.x + ray.direction.x, 11.0, 1e-5);
-    EXPECT_NEAR(ray.origin.z + ray.direction.z, 33.0, 1e-5);
-    EXPECT_TRUE(std::isinf(shadow_ray(surface, {{0.0, 0.0, 1.0}, true, {}}).t_max));
 }
 
 TEST(Render, SamplesAreStratifiedInEachRunOfAPowerOfTwo) {
@@ -94,7 +78,7 @@ TEST(Render, SamplesAreStratifiedInEachRunOfAPowerOfTwo) {
         for (uint32_t first = 0; first < 64; first += 16) {
             std::set<int> columns, rows, cells;
             for (uint32_t i = first; i < first + 16; ++i) {
-                const Sample2 s = sample_2d(i, seed);
+                const Sample2 s = scrambled(sequence_point(i), seed);
                 EXPECT_TRUE(s.x >= 0 && s.x < 1 && s.y >= 0 && s.y < 1);
                 columns.insert(static_cast<int>(s.x * 16));
                 rows.insert(static_cast<int>(s.y * 16));
@@ -104,115 +88,6 @@ TEST(Render, SamplesAreStratifiedInEachRunOfAPowerOfTwo) {
             EXPECT_EQ(rows.size(), 16U);
             EXPECT_EQ(cells.size(), 16U);
         }
-    }
-}
-
-/// Lights of each kind, moved, turned, stretched, sheared and flattened, with widths from none to the widest.
-LightInput some_light(Random& random) {
-    constexpr LightKind kKinds[] = {LightKind::kPoint, LightKind::kSpot, LightKind::kSun, LightKind::kArea};
-    const auto happens = [&](double share) { return random.uniform(0, 1) < share; };
-    const auto angle = [&] {
-        return happens(0.1) ? 0.0 : happens(0.1) ? std::numbers::pi : random.uniform(0, std::numbers::pi);
-    };
-    LightInput input{};
-    input.kind = kKinds[static_cast<size_t>(random.uniform(0, 4))];
-    const Vec3d z = normalize(random.point(1.0));
-    const Tangents sides = tangents(z);
-    const Vec3d columns[3] = {sides.x, sides.y, z};
-    const Vec3d at = random.point(2.0);
-    for (size_t column = 0; column < 3; ++column) {
-        const double stretch = happens(0.05) ? 0.0 : random.uniform(0.3, 3.0);
-        const Vec3d shear = happens(0.5) ? random.point(2.0) : Vec3d{0.0, 0.0, 0.0};
-        for (size_t i = 0; i < 3; ++i) {
-            const int axis = static_cast<int>(i);
-            input.matrix.rows[i][column] = stretch * (columns[column][axis] + shear[axis]);
-            input.matrix.rows[i][3] = at[axis];
-        }
-    }
-    input.color = {1.0, 1.0, 1.0};
-    input.energy = 1.0;
-    input.radius = happens(0.2) ? 0.0 : happens(0.2) ? 1e-12 : random.uniform(0, 1.5);
-    input.angle = angle();
-    input.spot_size = angle();
-    input.size = input.size_y = 1.0;
-    return input;
-}
-
-TEST(Render, LightsReachWhatAnySampleOfThemReaches) {
-    Random random;
-    std::map<LightKind, int> unreached;
-    std::map<LightKind, int> samples;
-    for (int i = 0; i < 40000; ++i) {
-        const LightInput input = some_light(random);
-        const Light light(input, {0.0, 0.0, 0.0});
-        const Vec3d point = random.point(4.0);
-        const Vec3d normal = normalize(random.point(1.0));
-        const bool may_reach = light.may_reach(point, normal);
-        unreached[input.kind] += may_reach ? 0 : 1;
-        for (uint32_t s = 0; s < 16; ++s) {
-            const bool reaches = light.sample(point, normal, sample_2d(s, static_cast<uint32_t>(i))).has_value();
-            samples[input.kind] += reaches ? 1 : 0;
-            ASSERT_TRUE(may_reach || !reaches) << i;
-        }
-    }
-    // Of ten thousand points each, half lie behind a lamp; of those before a spot most are outside its cone.
-    EXPECT_GT(unreached[LightKind::kPoint], 3000);
-    EXPECT_GT(unreached[LightKind::kSpot], 6000);
-    EXPECT_GT(unreached[LightKind::kSun], 1500);
-    for (const LightKind kind : {LightKind::kPoint, LightKind::kSpot, LightKind::kSun}) {
-        EXPECT_GT(samples[kind], 12000) << static_cast<int>(kind);
-    }
-}
-
-TEST(Render, AnglesAreWithinTheirErrorAllTheWayRound) {
-    constexpr int kSteps = 4096;
-    for (int i = -kSteps; i <= kSteps; ++i) {
-        const double angle = std::numbers::pi / 4 * i / kSteps;
-        const SineCosine found = sine_cosine(angle);
-        EXPECT_NEAR(found.sine, std::sin(angle), 1e-12);
-        EXPECT_NEAR(found.cosine, std::cos(angle), 1e-12);
-    }
-    for (int i = 0; i < kSteps; ++i) {
-        const double turns = (i + 0.25) / kSteps;
-        const Sample2 place = sample_circle(turns);
-        EXPECT_NEAR(place.x, std::cos(2 * std::numbers::pi * turns), 2e-12);
-        EXPECT_NEAR(place.y, std::sin(2 * std::numbers::pi * turns), 2e-12);
-    }
-}
-
-/// A quarter of the points lies within half the radius, an eighth in each eighth of the turn.
-TEST(Render, DiskIsCoveredEvenly) {
-    constexpr uint32_t kSamples = 4096;
-    uint32_t inner = 0;
-    uint32_t eighth[8] = {};
-    for (uint32_t i = 0; i < kSamples; ++i) {
-        const Sample2 place = sample_disk(sample_2d(i, 11));
-        const double square = place.x * place.x + place.y * place.y;
-        EXPECT_LE(square, 1 + 1e-11);
-        inner += square < 0.25 ? 1 : 0;
-        ++eighth[(place.x < 0 ? 1 : 0) + (place.y < 0 ? 2 : 0) + (std::abs(place.x) < std::abs(place.y) ? 4 : 0)];
-    }
-    EXPECT_NEAR(inner, kSamples * 0.25, 16);
-    for (const uint32_t count : eighth) {
-        EXPECT_NEAR(count, kSamples * 0.125, 16);
-    }
-}
-
-TEST(Render, DirectionsFollowTheirDensity) {
-    Random random;
-    for (int i = 0; i < 20; ++i) {
-        const Vec3d axis = i == 0 ? Vec3d{0, 0, -1} : normalize(random.point(1.0));
-        double mean_cosine = 0.0, lowest = 1.0;
-        for (uint32_t s = 0; s < 1024; ++s) {
-            const Vec3d hemisphere = sample_cosine(axis, sample_2d(s, 5));
-            EXPECT_NEAR(length(hemisphere), 1.0, 1e-9);
-            EXPECT_GE(dot(hemisphere, axis), -1e-9);
-            mean_cosine += dot(hemisphere, axis) / 1024;
-            lowest = std::min(lowest, dot(sample_cone(axis, 0.8, sample_2d(s, 6)), axis));
-        }
-        EXPECT_NEAR(mean_cosine, 2.0 / 3.0, 1e-3);
-        EXPECT_GE(lowest, 0.8 - 1e-9);
-        EXPECT_LT(lowest, 0.801);
     }
 }
 
