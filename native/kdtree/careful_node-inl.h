@@ -12,6 +12,7 @@
 #include <hwy/highway.h>
 
 #include "kdtree/build_kernels.h"
+#include "kdtree/leaf_parts-inl.h"
 #include "kdtree/partition-inl.h"
 #include "kdtree/sah-inl.h"
 #include "kdtree/small_node-inl.h"
@@ -39,7 +40,7 @@ class CarefulNode {
     float build(const OpenNode& node, const References& references, size_t room = 0) {
         const float leaf_cost = block_cost_ * static_cast<float>(block_count(node.count));
         if (leaf_cost <= traversal_cost_) {
-            output_.add_leaf({references.triangle, node.count}, node.tight);
+            write_leaf(references, node);
             return leaf_cost;
         }
         if (node.count <= input_.parameters->small_node) {
@@ -47,7 +48,7 @@ class CarefulNode {
         }
         const Split split = search_(node, references);
         if (split.axis < 0) {
-            output_.add_leaf({references.triangle, node.count}, node.tight);
+            write_leaf(references, node);
             return leaf_cost;
         }
         if (children_.references().triangle == nullptr) {
@@ -80,7 +81,7 @@ class CarefulNode {
         const float cost = traversal_cost_ + (area(left) * left_cost + area(right) * right_cost);
         if (leaf_cost <= cost) {
             output_.rewind(index, first_triangle);
-            output_.add_leaf({references.triangle, node.count}, node.tight);
+            write_leaf(references, node);
             return leaf_cost;
         }
         output_.close_inner(index, split, right_child);
@@ -88,6 +89,16 @@ class CarefulNode {
     }
 
  private:
+    void write_leaf(const References& references, const OpenNode& node) {
+        using Parts = LeafParts<4>;
+        if (node.count > Parts::kCapacity) {  // none of its planes gains anything
+            output_.add_leaf({references.triangle, node.count}, node.tight);
+            return;
+        }
+        Parts(references, node, input_.parameters->arrange)
+            .write(Members<4>::first(node.count), node.count, node.tight, output_);
+    }
+
     static constexpr uint32_t kMargin = 16;  ///< references that vector code may write past the end
 
     const SubtreeInput& input_;
