@@ -2,7 +2,7 @@
 # make preview [SCENE=file]   sets everything up, draws the scene, prints what building its tree cost per thread count
 # make test                   sets everything up, runs the C++ and the Python tests
 # make long-run [RAYS=1e8]    judges so many hard rays in exact arithmetic, and says what follows from finding no error
-# make test-neon              the C++ tests under an emulator of ARM; the same tree and the same hits on all instruction sets
+# make test-neon              the C++ tests under an emulator of ARM; the same trees, hits and light samples on all instruction sets
 # make package                build/espalier-VERSION.zip, the extension as users install it
 # make bench [BENCH=--quick]  measures builds and rays beside Embree on the meshes it finds; BENCH=--help tells more
 # make report [REPORT=--quick] one page: speed against error beside other tracers, and the pixels of Cycles

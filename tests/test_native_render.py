@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from typing import Any
 
 import espalier_native
@@ -413,6 +416,11 @@ BUSY_LIGHTS = [
     light("POINT", moved(0.5, 0.5, 1), 20.0, radius=0.1),
     light("AREA", moved(0.2, 0.8, 1), 10.0, size=0.5, shape="DISK"),
 ]
+LIGHTS_OF_ALL_KINDS = [
+    *BUSY_LIGHTS,
+    light("SPOT", moved(0.8, 0.2, 1), 30.0, spot_size=1.0, spot_blend=0.5, radius=0.05),
+    light("SUN", moved(0, 0, 1), 0.5, angle=0.1),
+]
 BUSY_VIEW = camera(looking((0.5, -1, 1), (0.5, 0.5, 0)), frustum(-0.5, 0.5, -0.35, 0.35))
 
 
@@ -424,6 +432,22 @@ def test_picture_is_the_same_for_any_number_of_threads_and_quality() -> None:
         for threads in (1, 2, 3, 8):
             image = draw(what, BUSY_VIEW, BUSY_LIGHTS, (70, 50), (0.1, 0.2, 0.3), threads=threads, quality=quality)
             assert image.tobytes() == expected.tobytes(), (quality, threads)
+
+
+@pytest.mark.parametrize("target", espalier_native.simd_targets())
+def test_picture_is_the_same_on_every_instruction_set(target: str) -> None:
+    script = (
+        "import sys\n"
+        "from tests.test_native_render import *\n"
+        "image = draw(scene([mesh(*bumpy_sheet(60))]), BUSY_VIEW, LIGHTS_OF_ALL_KINDS, (70, 50), (0.1, 0.2, 0.3))\n"
+        "sys.stdout.buffer.write(image.tobytes())\n"
+    )
+    path = os.pathsep.join(p for p in sys.path if p)
+    environment = {**os.environ, "PYTHONPATH": path, "ESPALIER_SIMD": target}
+    command = [sys.executable, "-c", script]
+    picture = subprocess.run(command, env=environment, capture_output=True, check=True, timeout=120).stdout
+    expected = draw(scene([mesh(*bumpy_sheet(60))]), BUSY_VIEW, LIGHTS_OF_ALL_KINDS, (70, 50), (0.1, 0.2, 0.3))
+    assert picture == expected.tobytes()
 
 
 def test_result_tells_what_was_done() -> None:

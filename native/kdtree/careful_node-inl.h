@@ -89,9 +89,10 @@ class CarefulNode {
     }
 
  private:
-    void write_leaf(const References& references, const OpenNode& node) {
+    HWY_NOINLINE void write_leaf(const References& references, const OpenNode& node) {
         using Parts = LeafParts<4>;
-        if (node.count > Parts::kCapacity) {  // none of its planes gains anything
+        // Without parts, or, rarely, with so many references that they are left as they are.
+        if (part_count(block_count(node.count)) == 0 || node.count > Parts::kCapacity) {
             output_.add_leaf({references.triangle, node.count}, node.tight);
             return;
         }

@@ -89,16 +89,17 @@ class BoxRow {
         }
         return {{row[0], row[1], row[2]}, {0 - row[4], 0 - row[5], 0 - row[6]}};
     }
-    HWY_INLINE float half_area() const {
+    /// Of the box with lengths in another unit.
+    HWY_INLINE float half_area(float unit) const {
 #if HWY_TARGET == HWY_SSE4 || HWY_TARGET == HWY_NEON
         const auto size = hn::Neg(hn::Add(part_[0], part_[1]));
 #else
-        const hn::Full128<float> d;
-        const auto size = hn::Neg(hn::Add(hn::LowerHalf(part_[0]), hn::UpperHalf(d, part_[0])));
+        const auto size = hn::Neg(hn::Add(hn::LowerHalf(part_[0]), hn::UpperHalf(hn::Full128<float>(), part_[0])));
 #endif
-        const auto yz = hn::Mul(size, hn::Shuffle0321(size));  // xy, yz, ...
-        const auto zx = hn::Mul(size, hn::Shuffle1032(size));  // xz, ...
-        return hn::GetLane(hn::Add(hn::Add(yz, zx), hn::Shuffle2301(yz)));
+        const auto scaled = hn::Mul(size, hn::Set(hn::Full128<float>(), unit));
+        const auto with_next = hn::Mul(scaled, hn::Shuffle0321(scaled));         // xy, yz, ...
+        const auto with_second_next = hn::Mul(scaled, hn::Shuffle1032(scaled));  // xz, ...
+        return hn::GetLane(hn::Add(hn::Add(with_next, with_second_next), hn::Shuffle2301(with_next)));
     }
 
  private:
@@ -138,12 +139,11 @@ class LeafParts {
             *leaf.box = union_of(places, count).cut_to(BoxRow::of(bounds)).box();
             copy_triangles(places, count, leaf.triangles);
             std::fill_n(leaf.part_boxes, parts, *leaf.box);
-        } else if (count <= 64) {
-            *leaf.box = Arrangement<1>(*this, members, places, BoxRow::of(bounds), leaf).write(count).box();
-        } else if (count <= 128) {
-            *leaf.box = Arrangement<2>(*this, members, places, BoxRow::of(bounds), leaf).write(count).box();
-        } else {
-            *leaf.box = Arrangement<kWords>(*this, members, places, BoxRow::of(bounds), leaf).write(count).box();
+        } else if (kWords == 1 || count <= 64) {
+            *leaf.box = Arrangement<1>(*this, members, places, bounds, leaf).write(count).box();
+        } else if constexpr (kWords > 1) {
+            *leaf.box = count <= 128 ? Arrangement<2>(*this, members, places, bounds, leaf).write(count).box()
+                                     : Arrangement<kWords>(*this, members, places, bounds, leaf).write(count).box();
         }
     }
 
@@ -253,8 +253,13 @@ class LeafParts {
     class Arrangement {
      public:
         HWY_INLINE Arrangement(const LeafParts& node, const Members<kWords>& members, const uint8_t* places,
-                               const BoxRow& bounds, const SubtreeOutput::Leaf& leaf)
-            : node_(node), places_(places), bounds_(bounds), triangles_(leaf.triangles), boxes_(leaf.part_boxes) {
+                               const Box3f& bounds, const SubtreeOutput::Leaf& leaf)
+            : node_(node),
+              places_(places),
+              bounds_(BoxRow::of(bounds)),
+              unit_(1 / std::max(largest_of(bounds.size()), 0x1p-100F)),
+              triangles_(leaf.triangles),
+              boxes_(leaf.part_boxes) {
             const hn::CappedTag<uint8_t, 64> d;
             for (size_t axis = 0; axis < 3; ++axis) {
                 uint8_t steps[kCapacity + kMargin];
@@ -316,7 +321,7 @@ class LeafParts {
                 uint8_t places[kCapacity + kMargin];
                 pick(places_, halves.members[half], places);
                 halves.box[half] = node_.union_of(places, counts[half]).cut_to(bounds_);
-                halves.cost += halves.box[half].half_area() * static_cast<float>(block_count(counts[half]));
+                halves.cost += halves.box[half].half_area(unit_) * static_cast<float>(block_count(counts[half]));
             }
             return halves;
         }
@@ -361,6 +366,7 @@ class LeafParts {
         const LeafParts& node_;
         const uint8_t* places_;
         BoxRow bounds_;
+        float unit_;  ///< such that areas neither overflow nor vanish
         uint32_t* triangles_;
         Box3f* boxes_;
         Members<kN> middles_[3][kStepBits];  ///< those that have each bit in their step, the highest first

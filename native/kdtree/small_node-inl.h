@@ -13,8 +13,10 @@
 
 #include <hwy/highway.h>
 
+#include <algorithm>
 #include <bit>
 #include <cstring>
+#include <limits>
 
 #include "kdtree/binning-inl.h"
 #include "kdtree/build_kernels.h"

@@ -41,7 +41,9 @@ struct Light {
     Vec3d strength;        // bulb, area: W/sr along the axis; sun: W/m²; sky: W/m²/sr at the zenith
     Vec3d nadir;           // sky: W/m²/sr
     Vec3d span_x, span_y;  // area: its sides; spot: rows that measure a direction across the cone
-    double radius = 0.0, cos_half = 1.0, spot_fade = 0.0;
+    double radius = 0.0;
+    double cos_half = 1.0;   // of half the angle across a spot's cone or a sun's disk
+    double spot_fade = 0.0;  // the range of cosines over which a spot fades
 
  private:
     Light() = default;

@@ -11,10 +11,8 @@
 
 #include <hwy/highway.h>
 
-#include <algorithm>
 #include <bit>
 #include <cstdint>
-#include <limits>
 #include <numbers>
 
 #include "kdtree/compress-inl.h"
@@ -119,7 +117,7 @@ HWY_INLINE RayColumns rays_to(const RealVec3& to_light, const RealVec3& point, c
     const RealVec3 end = point + to_light;
     const Real end_size = hn::Max(hn::Max(hn::Abs(end.x), hn::Abs(end.y)), hn::Abs(end.z));
     const Real end_error = (end_size + start_size) * all_lanes(0x1p-20) / length(to_light);
-    return {end - start, hn::Max(all_lanes(0.0), all_lanes(1.0) - end_error)};
+    return {end - start, hn::Max(all_lanes(1.0) - end_error, all_lanes(0.0))};
 }
 
 HWY_INLINE RealVec3 load(const double (&columns)[3][LitPoints::kGroup], size_t lane) {

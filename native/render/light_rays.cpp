@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 #include "render/light_rays.h"
 
+#include "geometry/vec.h"
 #include "kdtree/simd_config.h"
 #include "kdtree/simd_target.h"
 #include "render/shading.h"

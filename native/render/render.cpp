@@ -2,16 +2,14 @@
 #include "render/render.h"
 
 #include <algorithm>
-#include <array>
 #include <chrono>
-#include <cmath>
-#include <limits>
 #include <vector>
 
 #include "geometry/float_environment.h"
 #include "kdtree/parallel.h"
 #include "kdtree/traversal.h"
 #include "render/light_rays.h"
+#include "render/sampling.h"
 #include "render/shading.h"
 
 namespace espalier {

@@ -63,7 +63,7 @@ HWY_INLINE Real fraction(Bits bits) {
     return (hn::PromoteTo(RealTag(), shifted) + all_lanes(0x1p31)) * all_lanes(0x1p-32);
 }
 
-/// As the function of one point.
+/// As scrambled() of one point in sampling.h.
 HWY_INLINE RealPair scrambled(Bits x, Bits y, Bits seed) {
     const hn::DFromV<Bits> d;
     return {fraction(x ^ hashed(seed)), fraction(y ^ hashed(seed ^ hn::Set(d, kSecondScramble)))};
@@ -114,7 +114,7 @@ HWY_INLINE Tangents tangents(const RealVec3& n) {
 HWY_INLINE RealVec3 sample_cosine(const RealVec3& n, RealPair s) {
     const RealPair d = sample_disk(s);
     const Tangents t = tangents(n);
-    const Real height = hn::Sqrt(hn::Max(all_lanes(0.0), all_lanes(1.0) - d.x * d.x - d.y * d.y));
+    const Real height = hn::Sqrt(hn::Max(all_lanes(1.0) - d.x * d.x - d.y * d.y, all_lanes(0.0)));
     return t.x * d.x + t.y * d.y + n * height;
 }
 
@@ -122,13 +122,13 @@ HWY_INLINE RealVec3 sample_cosine(const RealVec3& n, RealPair s) {
 HWY_INLINE RealPair sample_circle(Real turns) {
     const Real quarters = hn::Floor(all_lanes(4.0) * turns + all_lanes(0.5));  // 0 to 4
     const auto [sine, cosine] = sine_cosine(all_lanes(std::numbers::pi / 2.0) * (all_lanes(4.0) * turns - quarters));
-    const RealMask first = hn::Eq(quarters, all_lanes(1.0));
-    const RealMask second = hn::Eq(quarters, all_lanes(2.0));
-    const RealMask third = hn::Eq(quarters, all_lanes(3.0));
-    const RealMask is_odd = hn::Or(first, third);
+    const RealMask is_one = hn::Eq(quarters, all_lanes(1.0));
+    const RealMask is_two = hn::Eq(quarters, all_lanes(2.0));
+    const RealMask is_three = hn::Eq(quarters, all_lanes(3.0));
+    const RealMask is_odd = hn::Or(is_one, is_three);
     const Real x = hn::IfThenElse(is_odd, hn::Neg(sine), cosine);
     const Real y = hn::IfThenElse(is_odd, cosine, sine);
-    const RealMask is_beyond = hn::Or(second, third);
+    const RealMask is_beyond = hn::Or(is_two, is_three);
     return {hn::IfThenElse(is_beyond, hn::Neg(x), x), hn::IfThenElse(is_beyond, hn::Neg(y), y)};
 }
 
@@ -136,7 +136,7 @@ HWY_INLINE RealPair sample_circle(Real turns) {
 HWY_INLINE RealVec3 sample_cone(const RealVec3& axis, Real cos_half, RealPair s) {
     const Real one = all_lanes(1.0);
     const Real cos_theta = one - s.x * (one - cos_half);
-    const Real sin_theta = hn::Sqrt(hn::Max(all_lanes(0.0), one - cos_theta * cos_theta));
+    const Real sin_theta = hn::Sqrt(hn::Max(one - cos_theta * cos_theta, all_lanes(0.0)));
     const RealPair side = sample_circle(s.y);
     const Tangents t = tangents(axis);
     return axis * cos_theta + t.x * (sin_theta * side.x) + t.y * (sin_theta * side.y);

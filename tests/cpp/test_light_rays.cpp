@@ -1,14 +1,17 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <array>
 #include <cmath>
+#include <limits>
 #include <map>
 #include <numbers>
 #include <random>
 #include <vector>
 
 #include "render/light_rays.h"
+#include "render/shading.h"
 
 namespace espalier {
 namespace {
@@ -165,10 +168,12 @@ TEST(LightRays, AreThoseOfOnePointAtATime) {
         const LightInput input = some_light(random);
         const uint32_t dimension = 1 + i % 5;
         LitPoints points;
+        std::vector<SurfacePoint> surfaces;
         std::vector<Expected> expected;
-        for (uint32_t target = 0; target < 13; ++target) {  // five lanes of the second group are empty
+        for (uint32_t target = 0; target < 13; ++target) {  // the second group is not full
             SurfacePoint surface = surface_at(random.point(4.0), normalize(random.point(1.0)));
-            surface.base_color = {0.25F, 0.5F, 1.0F};
+            surface.base_color = Vec3f{0.25F, 0.5F, 1.0F} * static_cast<float>(1 + target);
+            surfaces.push_back(surface);
             const uint32_t pixel = i * 13 + target;
             points.add(surface, pixel, sequence_point(target), target);
             const uint32_t seed = hash_bits(pixel ^ dimension_key(dimension));
@@ -182,14 +187,23 @@ TEST(LightRays, AreThoseOfOnePointAtATime) {
             const bool arrives = next < lit.rays.size() && lit.arrivals[next].target == target;
             ASSERT_TRUE(arrives == (sample.doubt > 0) || std::abs(sample.doubt) < 1e-9) << i << ' ' << target;
             (arrives ? arrived : missed)[input.kind] += 1;
-            if (!arrives) {
+            if (!arrives || sample.doubt <= 0) {
+                next += arrives ? 1 : 0;
                 continue;
             }
             const Ray& ray = lit.rays[next];
             const double size = length(sample.to_light);
             EXPECT_LE(length(to_double(ray.direction) - sample.to_light), 1e-6 + 1e-7 * size);
-            const Vec3d colour{0.25, 0.5, 1.0};
-            const Vec3d light = sample.irradiance * colour / kPi;
+            EXPECT_EQ(ray.origin, shadow_ray_start(surfaces[target]));
+            EXPECT_EQ(ray.t_min, 0.0F);
+            if (input.kind == LightKind::kSun) {
+                EXPECT_EQ(ray.t_max, std::numeric_limits<float>::infinity());
+            } else {  // it stops short of the lamp by more than the errors of both ends, and by little more
+                const double short_by = (1 - static_cast<double>(ray.t_max)) * size;
+                EXPECT_GE(short_by, 0x1p-20 * largest_of(surfaces[target].position) - 1e-7 * size);
+                EXPECT_LE(short_by, 0x1p-18 * (length(surfaces[target].position) + size));
+            }
+            const Vec3d light = sample.irradiance * to_double(surfaces[target].base_color) / kPi;
             EXPECT_LE(length(lit.arrivals[next].radiance - light), 1e-8 * length(light) / std::min(1.0, sample.doubt))
                 << i << ' ' << target;
             ++next;
@@ -261,6 +275,19 @@ TEST(LightRays, CoverARoundLampEvenly) {
     EXPECT_NEAR(inner, kSamples * 0.25, 16);
     for (const uint32_t count : eighth) {
         EXPECT_NEAR(count, kSamples * 0.125, 16);
+    }
+}
+
+/// Of a sky that is linear in height, a surface that looks up gets the mean of what is up and down, and a third of what
+/// they differ by on top.
+TEST(LightRays, BringMoreFromTheSkysBrighterSide) {
+    for (const double up : {1.0, -1.0}) {
+        const LitRays lit = samples_of(Light::sky({1, 1, 1}, {0.25, 0.25, 0.25}), {}, {0, 0, up}, 1024);
+        double light = 0;
+        for (const Arrival& arrival : lit.arrivals) {
+            light += arrival.radiance.x / 1024;
+        }
+        EXPECT_NEAR(light, 0.625 + up * 0.25, 1e-3);
     }
 }
 

@@ -356,25 +356,6 @@ TEST(Tree, LeavesComeInPartsThatLieApart) {
     }
 }
 
-/// Strips as long as the leaf that they make up, each in every second place of the one before: what is next to each
-/// other lies apart in the mesh, and along the longest side all have one middle.
-TEST(Tree, PartsOfLeavesHaveSmallBoxes) {
-    Mesh mesh;
-    for (uint32_t i = 0; i < 32; ++i) {
-        const auto height = static_cast<float>(i * 7 % 32) / 32;
-        mesh.add_triangle({0, 0, height}, {16, 0, height}, {8, 0.5F, height + 0.01F});
-    }
-    for (const Quality quality : {Quality::kBalanced, Quality::kBest, Quality::kExact}) {
-        const Tree tree = build(mesh.soup(), {quality, 1});
-        ASSERT_EQ(tree.nodes.size(), 1U);
-        std::vector<Box3f> parts;
-        for_each_leaf(tree, [&](uint32_t, uint32_t, const Box3f& box) { parts.push_back(box); });
-        ASSERT_EQ(parts.size(), 2U);
-        std::sort(parts.begin(), parts.end(), [](const Box3f& a, const Box3f& b) { return a.lower.z < b.lower.z; });
-        EXPECT_LT(parts[0].upper.z, parts[1].lower.z);
-    }
-}
-
 TEST(Tree, TakesMeshesOfAlmostNothing) {
     for (const int threads : {1, 2}) {
         for (uint32_t count = 0; count <= 3; ++count) {
