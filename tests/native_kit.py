@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -176,3 +179,15 @@ def rays_through(vertices: Floats, count: int, seed: int) -> tuple[Floats, Float
     directions = rng.uniform(lower, upper, (count, 3)) - origins
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return origins.astype(np.float32), directions.astype(np.float32)
+
+
+def output_of(script: str, **environment: str) -> bytes:
+    """What a script prints that Python runs in a process of its own, with these variables on top of this process's."""
+    path = os.pathsep.join(p for p in sys.path if p)
+    return subprocess.run(
+        [sys.executable, "-c", script],
+        env={**os.environ, "PYTHONPATH": path, **environment},
+        capture_output=True,
+        check=True,
+        timeout=120,
+    ).stdout

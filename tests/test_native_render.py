@@ -3,9 +3,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from typing import Any
 
 import espalier_native
@@ -24,6 +21,7 @@ from tests.native_kit import (
     looking,
     mesh,
     moved,
+    output_of,
     placed,
     rotation,
     scene,
@@ -442,10 +440,7 @@ def test_picture_is_the_same_on_every_instruction_set(target: str) -> None:
         "image = draw(scene([mesh(*bumpy_sheet(60))]), BUSY_VIEW, LIGHTS_OF_ALL_KINDS, (70, 50), (0.1, 0.2, 0.3))\n"
         "sys.stdout.buffer.write(image.tobytes())\n"
     )
-    path = os.pathsep.join(p for p in sys.path if p)
-    environment = {**os.environ, "PYTHONPATH": path, "ESPALIER_SIMD": target}
-    command = [sys.executable, "-c", script]
-    picture = subprocess.run(command, env=environment, capture_output=True, check=True, timeout=120).stdout
+    picture = output_of(script, ESPALIER_SIMD=target)
     expected = draw(scene([mesh(*bumpy_sheet(60))]), BUSY_VIEW, LIGHTS_OF_ALL_KINDS, (70, 50), (0.1, 0.2, 0.3))
     assert picture == expected.tobytes()
 

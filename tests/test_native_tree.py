@@ -3,9 +3,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +11,17 @@ import espalier_native
 import numpy as np
 import pytest
 
-from tests.native_kit import Doubles, Floats, Ints, bumpy_sheet, nearest_hits, rays_through, real_mesh, sphere
+from tests.native_kit import (
+    Doubles,
+    Floats,
+    Ints,
+    bumpy_sheet,
+    nearest_hits,
+    output_of,
+    rays_through,
+    real_mesh,
+    sphere,
+)
 
 QUALITIES = ("draft", "balanced", "best", "exact")
 ONE_TRIANGLE = (np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32), np.array([[0, 1, 2]], np.int32))
@@ -103,13 +110,7 @@ def test_hits_do_not_depend_on_the_instruction_set(target: str) -> None:
         "print(tree.report['checksum'], *(hashlib.sha256(hits[k]).hexdigest() for k in sorted(hits)))\n"
     )
 
-    def run(environment: dict[str, str]) -> str:
-        command = [sys.executable, "-c", script]
-        path = os.pathsep.join(p for p in sys.path if p)
-        environment = {**os.environ, "PYTHONPATH": path, **environment}
-        return subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=120).stdout
-
-    assert run({"ESPALIER_SIMD": target}) == run({})
+    assert output_of(script, ESPALIER_SIMD=target) == output_of(script)
 
 
 def cost_of_plane(lower: Doubles, upper: Doubles, axis: int, plane: float) -> float:
