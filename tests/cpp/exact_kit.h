@@ -13,7 +13,6 @@
 
 #include "geometry/triangle.h"
 #include "geometry/vec.h"
-#include "kdtree/simd_target.h"
 
 namespace espalier {
 
@@ -88,16 +87,6 @@ constexpr int kRanges[][2] = {{-1, 0}, {-20, 20}, {-140, -120}, {-60, -40}, {50,
 
 inline bool has_area(const Vec3f (&corner)[3]) {
     return classify_face(corner[0], corner[1], corner[2]) == FaceFault::kNone;
-}
-
-/// Of code for several instruction sets, that which this machine runs.
-template <class Code>
-std::vector<Code> runnable(const std::vector<Code>& all) {
-    const std::vector<std::string> names = simd_target_names();
-    std::vector<Code> found;
-    std::copy_if(all.begin(), all.end(), std::back_inserter(found),
-                 [&](const Code& code) { return std::find(names.begin(), names.end(), code.name) != names.end(); });
-    return found;
 }
 
 }  // namespace espalier

@@ -6,6 +6,7 @@
 
 #include "exact_kit.h"
 #include "kdtree/simd_config.h"
+#include "runnable.h"
 
 #undef HWY_TARGET_INCLUDE
 #define HWY_TARGET_INCLUDE "test_build_bounds.cpp"

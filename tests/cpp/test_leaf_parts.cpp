@@ -9,7 +9,7 @@
 #include <vector>
 
 #include "kdtree/simd_config.h"
-#include "kdtree/simd_target.h"
+#include "runnable.h"
 
 #undef HWY_TARGET_INCLUDE
 #define HWY_TARGET_INCLUDE "test_leaf_parts.cpp"
@@ -39,16 +39,13 @@ struct Code {
 };
 
 std::vector<Code> code_under_test() {
-    std::vector<Code> code = {
+    return runnable<Code>({
 #if defined(__x86_64__)
         {"sse4", N_SSE4::write_leaf}, {"avx2", N_AVX2::write_leaf}, {"avx512", N_AVX3_DL::write_leaf}
 #else
         {"neon", N_NEON::write_leaf}
 #endif
-    };
-    const std::vector<std::string> names = simd_target_names();
-    std::erase_if(code, [&](const Code& c) { return std::find(names.begin(), names.end(), c.name) == names.end(); });
-    return code;
+    });
 }
 
 /// A node that is to become a leaf, and the leaf.

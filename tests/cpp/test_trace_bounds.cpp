@@ -13,6 +13,7 @@
 #include "geometry/exact_hit.h"
 #include "geometry/expansion.h"
 #include "kdtree/simd_config.h"
+#include "runnable.h"
 
 #undef HWY_TARGET_INCLUDE
 #define HWY_TARGET_INCLUDE "test_trace_bounds.cpp"
