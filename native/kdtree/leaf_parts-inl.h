@@ -49,16 +49,14 @@ struct Members {
 };
 
 /// A box in one or two vectors: the lower bounds, then the upper ones, negated, so that a union is a minimum.
-class BoxRow {
- public:
+struct BoxRow {
+    using D = hn::CappedTag<float, 8>;
     static constexpr size_t kLength = 8;
+    static constexpr size_t kVectors = kLength / hn::MaxLanes(D());
+    hn::Vec<D> part[kVectors];
 
     static HWY_INLINE BoxRow load(const float* row) {
-        BoxRow box;
-        for (size_t i = 0; i < kVectors; ++i) {
-            box.part_[i] = hn::Load(D(), row + i * hn::MaxLanes(D()));
-        }
-        return box;
+        return of_parts([&](size_t i) { return hn::Load(D(), row + i * hn::MaxLanes(D())); });
     }
     static HWY_INLINE BoxRow of(const Box3f& box) {
         const Vec3f lower = box.lower;
@@ -66,46 +64,43 @@ class BoxRow {
         alignas(32) const float row[kLength] = {lower.x, lower.y, lower.z, 0, upper.x, upper.y, upper.z, 0};
         return load(row);
     }
+    /// From each part's number. No row is made without its parts: GCC compiles a constructor that it makes itself for
+    /// the base instruction set, where a vector's can not be inlined.
+    template <class F>
+    static HWY_INLINE BoxRow of_parts(const F& f) {
+        if constexpr (kVectors == 1) {
+            return {{f(0)}};
+        } else {
+            return {{f(0), f(1)}};
+        }
+    }
 
     friend HWY_INLINE BoxRow unite(const BoxRow& a, const BoxRow& b) {
-        BoxRow box;
-        for (size_t i = 0; i < kVectors; ++i) {
-            box.part_[i] = hn::Min(a.part_[i], b.part_[i]);
-        }
-        return box;
+        return of_parts([&](size_t i) { return hn::Min(a.part[i], b.part[i]); });
     }
     HWY_INLINE BoxRow cut_to(const BoxRow& bounds) const {
-        BoxRow box;
-        for (size_t i = 0; i < kVectors; ++i) {
-            box.part_[i] = hn::Max(part_[i], bounds.part_[i]);
-        }
-        return box;
+        return of_parts([&](size_t i) { return hn::Max(part[i], bounds.part[i]); });
     }
     HWY_INLINE Box3f box() const {
         alignas(32) float row[kLength];
         for (size_t i = 0; i < kVectors; ++i) {
             // Adding zero leaves none with a sign, which would depend on the order of the minima.
-            hn::Store(hn::Add(part_[i], hn::Zero(D())), D(), row + i * hn::MaxLanes(D()));
+            hn::Store(hn::Add(part[i], hn::Zero(D())), D(), row + i * hn::MaxLanes(D()));
         }
         return {{row[0], row[1], row[2]}, {0 - row[4], 0 - row[5], 0 - row[6]}};
     }
     /// Of the box with lengths in another unit.
     HWY_INLINE float half_area(float unit) const {
 #if HWY_TARGET == HWY_SSE4 || HWY_TARGET == HWY_NEON
-        const auto size = hn::Neg(hn::Add(part_[0], part_[1]));
+        const auto size = hn::Neg(hn::Add(part[0], part[1]));
 #else
-        const auto size = hn::Neg(hn::Add(hn::LowerHalf(part_[0]), hn::UpperHalf(hn::Full128<float>(), part_[0])));
+        const auto size = hn::Neg(hn::Add(hn::LowerHalf(part[0]), hn::UpperHalf(hn::Full128<float>(), part[0])));
 #endif
         const auto scaled = hn::Mul(size, hn::Set(hn::Full128<float>(), unit));
         const auto with_next = hn::Mul(scaled, hn::Shuffle0321(scaled));         // xy, yz, ...
         const auto with_second_next = hn::Mul(scaled, hn::Shuffle1032(scaled));  // xz, ...
         return hn::GetLane(hn::Add(hn::Add(with_next, with_second_next), hn::Shuffle2301(with_next)));
     }
-
- private:
-    using D = hn::CappedTag<float, kLength>;
-    static constexpr size_t kVectors = kLength / hn::MaxLanes(D());
-    hn::Vec<D> part_[kVectors];
 };
 
 /// Writes leaves that hold references of one node, of which there are at most 64 * kWords.
@@ -309,21 +304,24 @@ class LeafParts {
             return unite(halves.box[0], halves.box[1]);
         }
 
+        HWY_INLINE BoxRow box_of(const Members<kN>& members, uint32_t count) const {
+            uint8_t places[kCapacity + kMargin];
+            pick(places_, members, places);
+            return node_.union_of(places, count).cut_to(bounds_);
+        }
+
         /// Those whose middles come first along an axis, and the others.
         HWY_INLINE Halves halves_along(size_t axis, const Members<kN>& members, const uint32_t (&counts)[2]) const {
-            Halves halves;
-            halves.members[0] = lowest(members, axis, counts[0]);
+            const Members<kN> first = lowest(members, axis, counts[0]);
+            Members<kN> others;
             for (size_t w = 0; w < kN; ++w) {
-                halves.members[1].word[w] = members.word[w] & ~halves.members[0].word[w];
+                others.word[w] = members.word[w] & ~first.word[w];
             }
-            halves.cost = 0;
-            for (size_t half = 0; half < 2; ++half) {
-                uint8_t places[kCapacity + kMargin];
-                pick(places_, halves.members[half], places);
-                halves.box[half] = node_.union_of(places, counts[half]).cut_to(bounds_);
-                halves.cost += halves.box[half].half_area(unit_) * static_cast<float>(block_count(counts[half]));
-            }
-            return halves;
+            const BoxRow first_box = box_of(first, counts[0]);
+            const BoxRow others_box = box_of(others, counts[1]);
+            const float cost = first_box.half_area(unit_) * static_cast<float>(block_count(counts[0])) +
+                               others_box.half_area(unit_) * static_cast<float>(block_count(counts[1]));
+            return {{first, others}, {first_box, others_box}, cost};
         }
 
         /// So many of the references, those whose middles come first along an axis; where middles are in one step,
