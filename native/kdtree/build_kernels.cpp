@@ -268,21 +268,7 @@ HWY_AFTER_NAMESPACE();
 #if HWY_ONCE
 namespace espalier {
 
-const BuildKernels& build_kernels() {
-    switch (simd_target()) {
-#if defined(__x86_64__)
-        case HWY_AVX3_DL:
-            return N_AVX3_DL::kKernels;
-        case HWY_AVX2:
-            return N_AVX2::kKernels;
-        default:
-            return N_SSE4::kKernels;
-#else
-        default:
-            return N_NEON::kKernels;
-#endif
-    }
-}
+const BuildKernels& build_kernels() { return *ESPALIER_OF_TARGET(kKernels); }
 
 }  // namespace espalier
 #endif

@@ -38,24 +38,8 @@ struct TraceKernels {
     void (*occluded)(const Tree&, std::span<const Ray>, std::span<uint8_t>);
 };
 
-TraceKernels choose_kernels() {
-    switch (simd_target()) {
-#if defined(__x86_64__)
-        case HWY_AVX3_DL:
-            return {N_AVX3_DL::plain_intersect, N_AVX3_DL::plain_occluded};
-        case HWY_AVX2:
-            return {N_AVX2::plain_intersect, N_AVX2::plain_occluded};
-        default:
-            return {N_SSE4::plain_intersect, N_SSE4::plain_occluded};
-#else
-        default:
-            return {N_NEON::plain_intersect, N_NEON::plain_occluded};
-#endif
-    }
-}
-
 const TraceKernels& kernels() {
-    static const TraceKernels chosen = choose_kernels();
+    static const TraceKernels chosen{ESPALIER_OF_TARGET(plain_intersect), ESPALIER_OF_TARGET(plain_occluded)};
     return chosen;
 }
 

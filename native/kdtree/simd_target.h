@@ -15,3 +15,14 @@ int64_t simd_target();
 std::vector<std::string> simd_target_names();
 
 }  // namespace espalier
+
+/// The address of what has this name in the namespace of the instruction set in use, for files that compile it once per
+/// set.
+#if defined(__x86_64__)
+#define ESPALIER_OF_TARGET(name)                                         \
+    (espalier::simd_target() == HWY_AVX3_DL ? &espalier::N_AVX3_DL::name \
+     : espalier::simd_target() == HWY_AVX2  ? &espalier::N_AVX2::name    \
+                                            : &espalier::N_SSE4::name)
+#else
+#define ESPALIER_OF_TARGET(name) (&espalier::N_NEON::name)
+#endif

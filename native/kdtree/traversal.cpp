@@ -38,24 +38,8 @@ struct TraceKernels {
     void (*occluded)(const Tree&, std::span<const Ray>, std::span<uint8_t>);
 };
 
-TraceKernels choose_kernels() {
-    switch (simd_target()) {
-#if defined(__x86_64__)
-        case HWY_AVX3_DL:
-            return {N_AVX3_DL::intersect, N_AVX3_DL::occluded};
-        case HWY_AVX2:
-            return {N_AVX2::intersect, N_AVX2::occluded};
-        default:
-            return {N_SSE4::intersect, N_SSE4::occluded};
-#else
-        default:
-            return {N_NEON::intersect, N_NEON::occluded};
-#endif
-    }
-}
-
 const TraceKernels& kernels() {
-    static const TraceKernels chosen = choose_kernels();
+    static const TraceKernels chosen{ESPALIER_OF_TARGET(intersect), ESPALIER_OF_TARGET(occluded)};
     return chosen;
 }
 

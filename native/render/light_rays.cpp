@@ -16,27 +16,6 @@
 
 #if HWY_ONCE
 namespace espalier {
-namespace {
-
-using LightRays = size_t (*)(const Light&, const LitPoints&, uint32_t, Ray*, Arrival*);
-
-LightRays choose_kernel() {
-    switch (simd_target()) {
-#if defined(__x86_64__)
-        case HWY_AVX3_DL:
-            return N_AVX3_DL::light_rays;
-        case HWY_AVX2:
-            return N_AVX2::light_rays;
-        default:
-            return N_SSE4::light_rays;
-#else
-        default:
-            return N_NEON::light_rays;
-#endif
-    }
-}
-
-}  // namespace
 
 void LitPoints::clear() {
     groups.clear();
@@ -65,7 +44,7 @@ void LitPoints::add(const SurfacePoint& surface, uint32_t pixel, SequencePoint s
 
 size_t light_rays(const Light& light, const LitPoints& points, uint32_t dimension, std::span<Ray> rays,
                   std::span<Arrival> arrivals) {
-    static const LightRays chosen = choose_kernel();
+    static const auto chosen = ESPALIER_OF_TARGET(light_rays);
     return chosen(light, points, dimension, rays.data(), arrivals.data());
 }
 

@@ -8,6 +8,13 @@
 
 #include "kdtree/simd_target.h"
 
+/// A list of make(name, namespace) for each instruction set that code is compiled for.
+#if defined(__x86_64__)
+#define ESPALIER_FOR_EACH_SET(make) make("sse4", N_SSE4), make("avx2", N_AVX2), make("avx512", N_AVX3_DL)
+#else
+#define ESPALIER_FOR_EACH_SET(make) make("neon", N_NEON)
+#endif
+
 namespace espalier {
 
 /// Of code for several instruction sets, that which this machine runs.

@@ -39,13 +39,12 @@ struct Code {
 };
 
 std::vector<Code> code_under_test() {
-    return runnable<Code>({
-#if defined(__x86_64__)
-        {"sse4", N_SSE4::write_leaf}, {"avx2", N_AVX2::write_leaf}, {"avx512", N_AVX3_DL::write_leaf}
-#else
-        {"neon", N_NEON::write_leaf}
-#endif
-    });
+#define ESPALIER_CODE(name, set) \
+    {                            \
+        name, set::write_leaf    \
+    }
+    return runnable<Code>({ESPALIER_FOR_EACH_SET(ESPALIER_CODE)});
+#undef ESPALIER_CODE
 }
 
 /// A node that is to become a leaf, and the leaf.

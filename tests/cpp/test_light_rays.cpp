@@ -7,28 +7,16 @@
 #include <limits>
 #include <map>
 #include <numbers>
-#include <random>
 #include <vector>
 
 #include "render/light_rays.h"
 #include "render/shading.h"
+#include "uniform_random.h"
 
 namespace espalier {
 namespace {
 
 constexpr double kPi = std::numbers::pi;
-
-class Random {
- public:
-    double uniform(double low, double high) { return std::uniform_real_distribution<double>(low, high)(engine_); }
-    bool happens(double share) { return uniform(0, 1) < share; }
-    Vec3d point(double size) { return {uniform(-size, size), uniform(-size, size), uniform(-size, size)}; }
-    /// From none to the widest.
-    double angle() { return happens(0.1) ? 0.0 : happens(0.1) ? kPi : uniform(0, kPi); }
-
- private:
-    std::mt19937 engine_{12345};
-};
 
 /// Three unit vectors at right angles to each other, the last one along `z`.
 std::array<Vec3d, 3> frame_about(Vec3d z) {
@@ -36,8 +24,13 @@ std::array<Vec3d, 3> frame_about(Vec3d z) {
     return {x, cross(z, x), z};
 }
 
+/// From none to the widest.
+double some_angle(UniformRandom& random) {
+    return random.happens(0.1) ? 0.0 : random.happens(0.1) ? kPi : random.uniform(0, kPi);
+}
+
 /// Lights of each kind, moved, turned, stretched, sheared and flattened.
-LightInput some_light(Random& random) {
+LightInput some_light(UniformRandom& random) {
     constexpr LightKind kKinds[] = {LightKind::kPoint, LightKind::kSpot, LightKind::kSun, LightKind::kArea};
     LightInput input{};
     input.kind = kKinds[static_cast<size_t>(random.uniform(0, 4))];
@@ -55,8 +48,8 @@ LightInput some_light(Random& random) {
     input.color = {1.0, 2.0, 0.5};
     input.energy = 3.0;
     input.radius = random.happens(0.2) ? 0.0 : random.uniform(0, 1.5);
-    input.angle = random.angle();
-    input.spot_size = random.angle();
+    input.angle = some_angle(random);
+    input.spot_size = some_angle(random);
     input.spot_blend = random.happens(0.3) ? 0.0 : random.uniform(0, 1);
     input.shape = random.happens(0.5) ? AreaShape::kEllipse : AreaShape::kRectangle;
     input.size = random.uniform(0, 2);
@@ -162,7 +155,7 @@ Expected expected_of(const LightInput& input, Vec3d point, Vec3d normal, Sample2
 }
 
 TEST(LightRays, AreThoseOfOnePointAtATime) {
-    Random random;
+    UniformRandom random;
     std::map<LightKind, int> arrived, missed;
     for (uint32_t i = 0; i < 4000; ++i) {
         const LightInput input = some_light(random);
@@ -293,7 +286,7 @@ TEST(LightRays, BringMoreFromTheSkysBrighterSide) {
 
 /// From the sky with density cos / pi, from a sun within its cone and all round it.
 TEST(LightRays, FollowTheirDensity) {
-    Random random;
+    UniformRandom random;
     for (int i = 0; i < 20; ++i) {
         const Vec3d normal = i == 0 ? Vec3d{0, 0, -1} : normalize(random.point(1.0));
         double mean_cosine = 0.0;

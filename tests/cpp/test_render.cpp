@@ -2,7 +2,6 @@
 #include <gtest/gtest.h>
 
 #include <cmath>
-#include <random>
 #include <set>
 
 #include "render/camera.h"
@@ -11,6 +10,7 @@
 #include "render/sampling.h"
 #include "render/scene.h"
 #include "render/shading.h"
+#include "uniform_random.h"
 
 namespace espalier {
 namespace {
@@ -23,15 +23,6 @@ Matrix4 identity() {
     return matrix;
 }
 
-class Random {
- public:
-    double uniform(double low, double high) { return std::uniform_real_distribution<double>(low, high)(engine_); }
-    Vec3d point(double size) { return {uniform(-size, size), uniform(-size, size), uniform(-size, size)}; }
-
- private:
-    std::mt19937 engine_{12345};
-};
-
 /// The sign of the distance of a float point from the plane of three float points, in long double.
 long double side_of_plane(Vec3f p, Vec3f a, Vec3f b, Vec3f c) {
     using Wide = Vec3<long double>;
@@ -40,7 +31,7 @@ long double side_of_plane(Vec3f p, Vec3f a, Vec3f b, Vec3f c) {
 }
 
 TEST(Render, ShadowRaysStartStrictlyOnTheirSideAndNear) {
-    Random random;
+    UniformRandom random;
     for (int i = 0; i < 20000; ++i) {
         const double size = std::exp2(random.uniform(-12, 12));
         const Vec3d offset = random.point(std::exp2(random.uniform(-12, 16)));
@@ -92,7 +83,7 @@ TEST(Render, SamplesAreStratifiedInEachRunOfAPowerOfTwo) {
 }
 
 TEST(Render, NormalsStayPerpendicularUnderAnyMap) {
-    Random random;
+    UniformRandom random;
     for (int i = 0; i < 1000; ++i) {
         Matrix4 matrix = identity();
         for (size_t row = 0; row < 3; ++row) {

@@ -285,13 +285,7 @@ std::vector<Code> code_under_test() {
     {                                                                                             \
         name, set::depths_of, set::stack_of, set::filter, set::look, set::finish, set::kAsksFirst \
     }
-    return runnable<Code>({
-#if defined(__x86_64__)
-        ESPALIER_CODE("sse4", N_SSE4), ESPALIER_CODE("avx2", N_AVX2), ESPALIER_CODE("avx512", N_AVX3_DL)
-#else
-        ESPALIER_CODE("neon", N_NEON)
-#endif
-    });
+    return runnable<Code>({ESPALIER_FOR_EACH_SET(ESPALIER_CODE)});
 #undef ESPALIER_CODE
 }
 
