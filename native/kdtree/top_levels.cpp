@@ -79,7 +79,7 @@ void TopLevels::make_references() {
     std::vector<RejectedFaces> rejected(count);
     TopNode root{};
     root.segments.resize(count);
-    // Pages come first, but nobody waits for the last of them.
+    // Pages come first, but nobody waits for the last of them, where references do not lie.
     const size_t pages = is_large_ ? 0 : page_count();
     parallel_for(threads_, pages + count, [&](size_t task) {
         if (task < pages) {
@@ -113,15 +113,16 @@ size_t TopLevels::transient_pages() const {
     return pages <= static_cast<size_t>(threads_) ? pages : 0;
 }
 
-size_t TopLevels::page_count() const { return transient_pages() + words_in_use_ / kPageWords + 1; }
+size_t TopLevels::page_count() const { return words_in_use_ / kPageWords + 1 + transient_pages(); }
 
 /// Every thread takes pages of its own: two that first wrote to one page at the same time would both clear it.
 void TopLevels::take_page(size_t page) {
-    if (page < transient_pages()) {
-        transient_->take_huge_page(page);
+    const size_t of_references = words_in_use_ / kPageWords + 1;
+    if (page >= of_references) {
+        transient_->take_huge_page(page - of_references);
         return;
     }
-    const size_t begin = (page - transient_pages()) * kPageWords;
+    const size_t begin = page * kPageWords;
     first_places_.memory().take_pages(begin, std::min(words_in_use_, begin + kPageWords));
 }
 
