@@ -184,7 +184,7 @@ class SubtreeBuilder {
     /// Where the sorted references end; 0 if there is no room for what straddles.
     size_t sort_by_leaves(SortedNode& sorted, size_t begin, size_t room) {
         if (scratch_.references().triangle == nullptr) {
-            scratch_ = ReferenceBuffer(SortedChunk::kScratch, 0, 0);
+            scratch_ = ReferenceBuffer(SortedChunk::kScratch, 0);
         }
         const uint32_t count = sorted.node.count;
         uint64_t total = 0;  // what a sample that misleads may take is bounded

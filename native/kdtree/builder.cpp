@@ -47,7 +47,7 @@ BuildParameters parameters_of(Quality quality) {
 }
 
 /// What a triangle usually adds to subtrees until they are in their places, and to the plans of their nodes.
-constexpr size_t kTransientBytes = 19;
+constexpr size_t kBytesBehind = 19;
 
 /// Up to so many triangles the top's segments and what their partition takes are a good 1.4 references each.
 constexpr uint32_t kRoomy = 1U << 17;
@@ -65,12 +65,13 @@ class Builder {
         Stopwatch total;
         Stopwatch watch;
         PhaseTimes& phases = tree_.report.phases_ms;
-        std::optional<TransientMemory> memory(std::in_place, kTransientBytes * soup_.size());
+        const bool is_alone = threads_ == 1 && !is_large(soup_, parameters_);
+        std::optional<BuildMemory> memory(std::in_place, front_size(is_alone), kBytesBehind * soup_.size());
         std::optional<TopLevels> top;
         std::optional<Subtrees> made(std::in_place, soup_, parameters_, cancel_, threads_, *memory);
         Subtrees& subtrees = *made;
-        if (threads_ == 1 && !is_large(soup_, parameters_)) {
-            make_references_alone(subtrees);
+        if (is_alone) {
+            make_references_alone(*memory, subtrees);
             phases.bounds = watch.lap();
         } else {
             top.emplace(soup_, parameters_, cancel_, threads_, &*memory);
@@ -119,10 +120,18 @@ class Builder {
     int threads() const { return threads_; }
 
  private:
-    /// One thread needs no top levels: all references in one piece, and one subtree.
-    void make_references_alone(Subtrees& subtrees) {
+    /// Of the memory of the references, which becomes that of the blocks.
+    BuildMemory::Size front_size(bool is_alone) const {
         const uint32_t triangles = soup_.size();
-        ReferenceBuffer room(subtree_room(triangles), most_block_bytes(triangles), usual_block_bytes(triangles));
+        const size_t references = is_alone ? ReferenceBuffer::bytes_for(subtree_room(triangles))
+                                           : TopLevels::reference_bytes(triangles, threads_);
+        return {std::max(references, most_block_bytes(triangles)), usual_block_bytes(triangles)};
+    }
+
+    /// One thread needs no top levels: all references in one piece, and one subtree.
+    void make_references_alone(BuildMemory& memory, Subtrees& subtrees) {
+        const uint32_t triangles = soup_.size();
+        ReferenceBuffer room(subtree_room(triangles), memory.take_front<uint32_t>());
         room.memory().take_pages(0, usual_block_bytes(triangles) / sizeof(uint32_t));
         const uint32_t count = build_kernels().make_references(soup_, 0, triangles, room.references(), tree_.bounds,
                                                                tree_.report.rejected_faces);

@@ -15,7 +15,7 @@
 
 namespace espalier {
 
-class TransientMemory;
+class BuildMemory;
 
 /// Takes the pages that begin among these items now, which costs half of what taking small ones at the first write to
 /// each does. A system that cannot will take them later.
@@ -58,9 +58,9 @@ class LargeBuffer {
         if (huge != 0) {
             size_t space = mapped_;
             std::align(kHugePage, huge, memory, space);
-            ::madvise(memory, huge, MADV_HUGEPAGE);
         }
         data_ = static_cast<T*>(memory);
+        expect_use(expected_bytes);
     }
     LargeBuffer(LargeBuffer&& other) noexcept { *this = std::move(other); }
     LargeBuffer& operator=(LargeBuffer&& other) noexcept {
@@ -79,28 +79,51 @@ class LargeBuffer {
     /// How many of them so many bytes are worth: a tail too short for one of its own is left to small ones.
     static size_t huge_pages(size_t bytes) { return (bytes + kHugePage - kHugePagesFrom) / kHugePage; }
 
-    /// The same memory for other items, whatever it holds; what they do not need is given back. Fresh memory if they
-    /// need more.
+    /// Parts with so many items at the front, and what is left until the next huge page.
+    LargeBuffer take_front(size_t capacity) {
+        const auto end = reinterpret_cast<uintptr_t>(data_ + capacity);
+        const size_t taken = std::min(capacity + (0 - end) % kHugePage / sizeof(T), capacity_);
+        LargeBuffer front;
+        front.data_ = std::exchange(data_, data_ + taken);
+        front.capacity_ = taken;
+        capacity_ -= taken;
+        front.mapping_ = std::exchange(mapping_, data_);
+        front.mapped_ =
+            static_cast<size_t>(static_cast<std::byte*>(mapping_) - static_cast<std::byte*>(front.mapping_));
+        mapped_ -= front.mapped_;
+        return front;
+    }
+
+    /// The same memory for other items, whatever it holds, or fresh memory if they need more. What they do not need is
+    /// given back: with what it was taken from the front of, if that is all still there.
     template <class U>
-    LargeBuffer<U> reuse_for(size_t capacity) && {
+    LargeBuffer<U> reuse_for(size_t capacity, LargeBuffer<std::byte>& behind) && {
         if (capacity == 0 || capacity * sizeof(U) > bytes()) {
             return LargeBuffer<U>(capacity);
         }
         LargeBuffer<U> reused;
-        reused.data_ = reinterpret_cast<U*>(data_);
+        reused.data_ = reinterpret_cast<U*>(std::exchange(data_, nullptr));
         reused.capacity_ = capacity;
-        reused.mapping_ = std::exchange(mapping_, nullptr);
-        reused.mapped_ = mapped_;
-        const size_t needed =
-            reinterpret_cast<uintptr_t>(reused.data_ + capacity) - reinterpret_cast<uintptr_t>(reused.mapping_);
-        const size_t kept = (needed + kPage - 1) / kPage * kPage;
-        if (kept < mapped_) {
-            ::munmap(static_cast<std::byte*>(reused.mapping_) + kept, mapped_ - kept);
-            reused.mapped_ = kept;
+        auto* mapping = static_cast<std::byte*>(std::exchange(mapping_, nullptr));
+        const auto needed = static_cast<size_t>(reinterpret_cast<std::byte*>(reused.data_ + capacity) - mapping);
+        const size_t kept = std::min((needed + kPage - 1) / kPage * kPage, mapped_);
+        reused.mapping_ = mapping;
+        reused.mapped_ = kept;
+        if (mapping + mapped_ == behind.mapping_) {
+            behind.mapping_ = mapping + kept;
+            behind.mapped_ += mapped_ - kept;
+        } else if (kept < mapped_) {
+            ::munmap(mapping + kept, mapped_ - kept);
         }
-        data_ = nullptr;
         capacity_ = mapped_ = 0;
         return reused;
+    }
+
+    /// Asks for huge pages for so many bytes.
+    void expect_use(size_t expected_bytes) {
+        if (const size_t huge = kHugePage * huge_pages(std::min(bytes(), expected_bytes)); huge != 0) {
+            ::madvise(data_, huge, MADV_HUGEPAGE);
+        }
     }
 
     /// Takes the pages of items [begin, end) now (see above).
@@ -121,7 +144,7 @@ class LargeBuffer {
  private:
     template <class U>
     friend class LargeBuffer;
-    friend class TransientMemory;
+    friend class BuildMemory;
     static constexpr size_t kPage = size_t{64} << 10;  ///< the largest small page of any system
     /// From here on clearing the rest of a huge page costs no more than small pages do, and little memory is wasted.
     static constexpr size_t kHugePagesFrom = size_t{768} << 10;
@@ -131,14 +154,35 @@ class LargeBuffer {
     size_t mapped_ = 0;
 };
 
-/// Memory for buffers that lie side by side, so that huge pages hold many small ones, and are all given back together:
-/// whenever a piece is given back, all processors that use the process's memory have to be told, and wait.
-class TransientMemory {
+/// Memory of a build: at its front what is later kept, in part; behind that buffers that lie side by side, so that huge
+/// pages hold many small ones. All that is not kept is given back together: whenever a piece is given back, all
+/// processors that use the process's memory have to be told, and wait.
+class BuildMemory {
  public:
-    /// expected_bytes: how much of it will usually be used.
-    explicit TransientMemory(size_t expected_bytes)
-        : memory_(std::max(kLeastBytes, 2 * expected_bytes), expected_bytes),
-          huge_pages_(LargeBuffer<std::byte>::huge_pages(expected_bytes)) {}
+    /// In bytes; usual: how much of it will usually be used.
+    struct Size {
+        size_t most;
+        size_t usual;
+    };
+    BuildMemory(Size front, size_t usual_behind)
+        : memory_(front.most + LargeBuffer<std::byte>::kHugePage + std::max(kLeastBytes, 2 * usual_behind),
+                  front.usual),
+          front_(memory_.take_front(front.most)),
+          huge_pages_(LargeBuffer<std::byte>::huge_pages(usual_behind)) {
+        memory_.expect_use(usual_behind);
+    }
+
+    /// The front, which may outlive this.
+    template <class T>
+    LargeBuffer<T> take_front() {
+        const size_t capacity = front_.bytes() / sizeof(T);
+        return keep<T>(std::move(front_), capacity);
+    }
+    /// Of the front, so many items for what the tree keeps, or as many in fresh memory where it is too small.
+    template <class T, class U>
+    LargeBuffer<T> keep(LargeBuffer<U> front, size_t capacity) {
+        return std::move(front).template reuse_for<T>(capacity, memory_);
+    }
 
     /// What it returns must be destroyed before this. Any thread may call it.
     template <class T>
@@ -157,14 +201,15 @@ class TransientMemory {
         return LargeBuffer<T>(capacity);
     }
 
-    /// It has so many huge pages, which are taken when they are first written to, or now.
+    /// Behind the front it has so many huge pages, which are taken when they are first written to, or now.
     size_t huge_pages() const { return huge_pages_; }
     void take_huge_page(size_t page) { memory_.take_huge_page(page); }
 
  private:
     static constexpr size_t kLeastBytes = size_t{64} << 20;  ///< of addresses, not of memory
     LargeBuffer<std::byte> memory_;
-    size_t huge_pages_;
+    LargeBuffer<std::byte> front_;
+    size_t huge_pages_;  ///< behind the front
     std::atomic<size_t> used_{0};
 };
 

@@ -49,7 +49,7 @@ std::vector<BlockTask> cut_to_tasks(std::span<const TreePiece> pieces) {
 
 }  // namespace
 
-void build_layout(const TriangleSoup& soup, std::span<const TreePiece> pieces, int threads, TransientMemory& memory,
+void build_layout(const TriangleSoup& soup, std::span<const TreePiece> pieces, int threads, BuildMemory& memory,
                   Tree& tree) {
     const size_t blocks = tree.blocks.size();
     const auto nodes = static_cast<uint32_t>(tree.nodes.size());

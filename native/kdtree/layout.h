@@ -11,7 +11,7 @@ namespace espalier {
 /// Phase 5: derives from the finished kd-tree what rays walk through: triangle blocks, and eight-wide nodes collapsed
 /// from the tree's nodes, each child with its tight box, in the order that the split planes give for each ray octant.
 /// pieces: of all nodes, in order; tree.blocks has room for their triangles.
-void build_layout(const TriangleSoup& soup, std::span<const TreePiece> pieces, int threads, TransientMemory& memory,
+void build_layout(const TriangleSoup& soup, std::span<const TreePiece> pieces, int threads, BuildMemory& memory,
                   Tree& tree);
 
 }  // namespace espalier

@@ -32,7 +32,7 @@ OnDemand::OnDemand(const TriangleSoup& soup, const BuildParameters& parameters, 
       top_(soup_, parameters_, cancel, threads),
       threads_(threads),
       whole_(std::max(kWhole, parameters.one_thread)),
-      memory_(size_t{2} * soup.size() + kWhole),
+      memory_(ReferenceBuffer(size_t{2} * soup.size() + kWhole)),
       most_parts_(most_parts(soup.size())),
       parts_(most_parts_ / PartChunk::kSize + 1),
       most_blocks_(most_blocks(soup.size())) {}

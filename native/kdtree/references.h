@@ -50,17 +50,19 @@ class ReferenceBuffer {
     static constexpr size_t kSlack = 64;
 
     ReferenceBuffer() = default;
-    /// With address space for at least `later_bytes`, which the memory may be reused for, and huge pages for so much as
-    /// is usually used.
-    explicit ReferenceBuffer(size_t capacity, size_t later_bytes = 0, size_t usual_bytes = SIZE_MAX)
-        : stride_((capacity + kSlack + 15) / 16 * 16 + 16),
-          memory_(std::max(stride_ * kArrays, later_bytes / sizeof(uint32_t)), usual_bytes) {
+    /// usual_bytes: for how much it has huge pages.
+    explicit ReferenceBuffer(size_t capacity, size_t usual_bytes = SIZE_MAX)
+        : ReferenceBuffer(capacity, LargeBuffer<uint32_t>(stride_for(capacity) * kArrays, usual_bytes)) {}
+    /// In memory of at least bytes_for(capacity).
+    ReferenceBuffer(size_t capacity, LargeBuffer<uint32_t> memory)
+        : stride_(stride_for(capacity)), memory_(std::move(memory)) {
         for (size_t axis = 0; axis < 3; ++axis) {
             references_.lower[axis] = reinterpret_cast<float*>(memory_.data() + stride_ * axis);
             references_.upper[axis] = reinterpret_cast<float*>(memory_.data() + stride_ * (axis + 3));
         }
         references_.triangle = memory_.data() + stride_ * 6;
     }
+    static size_t bytes_for(size_t capacity) { return stride_for(capacity) * kArrays * sizeof(uint32_t); }
     const References& references() const { return references_; }
     size_t capacity() const { return stride_ - kSlack; }
     /// Of the memory, how much the references may take.
@@ -73,7 +75,10 @@ class ReferenceBuffer {
     }
 
  private:
-    size_t stride_ = 0;  ///< not a multiple of a page, so that the arrays do not compete for the same cache sets
+    /// Not a multiple of a page, so that the arrays do not compete for the same cache sets.
+    static size_t stride_for(size_t capacity) { return (capacity + kSlack + 15) / 16 * 16 + 16; }
+
+    size_t stride_ = 0;
     LargeBuffer<uint32_t> memory_;
     References references_;
 };

@@ -36,7 +36,7 @@ class SubtreeOutput {
  public:
     SubtreeOutput() = default;
     /// With room for what so many triangles usually become, in `memory` if there is one.
-    explicit SubtreeOutput(size_t triangles, TransientMemory* memory = nullptr) {
+    explicit SubtreeOutput(size_t triangles, BuildMemory* memory = nullptr) {
         reserve(triangles / 5 + 64, 5 * triangles / 2 / kBlockSize * kBlockSize + 1024, memory);
     }
 
@@ -134,13 +134,12 @@ class SubtreeOutput {
         take_pages(part_boxes_ + triangle_count_ / kBlockSize, part_boxes_ + triangle_limit_ / kBlockSize);
     }
 
-    void reserve(size_t nodes, size_t triangles, TransientMemory* transient = nullptr) {
+    void reserve(size_t nodes, size_t triangles, BuildMemory* shared = nullptr) {
         const size_t blocks = triangles / kBlockSize;
         const size_t bytes =
             nodes * (sizeof(KdNode) + sizeof(Box3f)) + blocks * (kBlockSize * sizeof(uint32_t) + sizeof(Box3f));
         // What has grown is twice as large as it had to be.
-        auto memory =
-            transient != nullptr ? transient->take<std::byte>(bytes) : LargeBuffer<std::byte>(bytes, bytes / 2);
+        auto memory = shared != nullptr ? shared->take<std::byte>(bytes) : LargeBuffer<std::byte>(bytes, bytes / 2);
         auto* new_nodes = reinterpret_cast<KdNode*>(memory.data());
         auto* new_boxes = reinterpret_cast<Box3f*>(new_nodes + nodes);
         auto* new_part_boxes = new_boxes + nodes;

@@ -227,7 +227,7 @@ void Subtrees::compact(TopLevels* top, Tree& tree) {
         throw std::length_error("the tree needs more nodes or blocks than its indices can count");
     }
     LargeBuffer<uint32_t> references = top != nullptr ? top->take_memory() : own_references_.take_memory();
-    tree.blocks = std::move(references).reuse_for<TriangleBlock>(triangles / kBlockSize);
+    tree.blocks = memory_.keep<TriangleBlock>(std::move(references), triangles / kBlockSize);
     tree.nodes = LargeBuffer<KdNode>(nodes);
     if (is_whole) {
         tree.nodes.take_pages(0, nodes);

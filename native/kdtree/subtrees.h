@@ -18,7 +18,7 @@ class Subtrees : public SubtreeSharing {
  public:
     /// memory: for what this needs itself; the references have their own.
     Subtrees(const TriangleSoup& soup, const BuildParameters& parameters, const std::atomic<bool>* cancel, int threads,
-             TransientMemory& memory)
+             BuildMemory& memory)
         : memory_(memory),
           soup_(soup),
           parameters_(parameters),
@@ -87,7 +87,7 @@ class Subtrees : public SubtreeSharing {
     Box3f& box(size_t place);
     size_t place_of(const Subtree& subtree, size_t node) const;
 
-    TransientMemory& memory_;
+    BuildMemory& memory_;
     const TriangleSoup& soup_;
     const BuildParameters& parameters_;
     const std::atomic<bool>* cancel_;

@@ -22,14 +22,22 @@ uint32_t choose_segment_size(uint32_t triangles, int threads) {
 constexpr uint32_t kMargin = 16;
 uint32_t with_slack(uint32_t count) { return count + count / 4 + 2 * kMargin; }
 
-/// For the references that the top usually makes, and what all threads take to partition them; and for those of
-/// subtrees and for blocks, if they follow in the same memory.
-SegmentMemory memory_for(uint32_t triangles, uint32_t segment_size, int threads, bool holds_subtrees) {
-    const size_t places = triangles + size_t{2} * with_slack(segment_size) * static_cast<size_t>(threads + 1);
-    if (!holds_subtrees) {
-        return SegmentMemory(places + triangles / 8);
+/// References that the top usually makes, and what all threads take to partition them.
+size_t places_of_top(uint32_t triangles, int threads) {
+    const size_t segment = with_slack(choose_segment_size(triangles, threads));
+    return triangles + 2 * segment * static_cast<size_t>(threads + 1);
+}
+
+/// And those of subtrees, if they follow in the same memory.
+size_t places_of_all(uint32_t triangles, int threads) {
+    return places_of_top(triangles, threads) + size_t{3} * triangles / 2;
+}
+
+ReferenceBuffer memory_for(uint32_t triangles, int threads, BuildMemory* memory) {
+    if (memory == nullptr) {
+        return ReferenceBuffer(places_of_top(triangles, threads) + triangles / 8);
     }
-    return SegmentMemory(places + size_t{3} * triangles / 2, most_block_bytes(triangles), usual_block_bytes(triangles));
+    return {places_of_all(triangles, threads), memory->take_front<uint32_t>()};
 }
 
 void add(const BinCounts& part, BinCounts& sum) {
@@ -43,6 +51,10 @@ void add(const BinCounts& part, BinCounts& sum) {
 
 }  // namespace
 
+size_t TopLevels::reference_bytes(uint32_t triangles, int threads) {
+    return ReferenceBuffer::bytes_for(places_of_all(triangles, threads));
+}
+
 References SegmentMemory::take(uint32_t count) {
     const std::lock_guard lock(mutex_);
     if (used_ + count > buffers_.back().capacity()) {
@@ -54,7 +66,7 @@ References SegmentMemory::take(uint32_t count) {
 }
 
 TopLevels::TopLevels(const TriangleSoup& soup, const BuildParameters& parameters, const std::atomic<bool>* cancel,
-                     int threads, TransientMemory* transient)
+                     int threads, BuildMemory* memory)
     : soup_(soup),
       parameters_(parameters),
       cancel_(cancel),
@@ -62,11 +74,11 @@ TopLevels::TopLevels(const TriangleSoup& soup, const BuildParameters& parameters
       kernels_(build_kernels()),
       is_large_(is_large(soup, parameters)),
       segment_size_(choose_segment_size(soup.size(), threads)),
-      transient_(transient),
-      memory_(memory_for(soup.size(), segment_size_, threads, transient != nullptr)),
+      build_memory_(memory),
+      memory_(memory_for(soup.size(), threads, memory)),
       first_places_(memory_.first()),
-      words_in_use_(std::max(transient == nullptr ? 0 : usual_block_bytes(soup.size()) / sizeof(uint32_t),
-                             first_places_.words())),
+      words_in_use_(
+          std::max(memory == nullptr ? 0 : usual_block_bytes(soup.size()) / sizeof(uint32_t), first_places_.words())),
       scratch_(static_cast<size_t>(threads)) {}
 
 void TopLevels::make_references() {
@@ -106,20 +118,20 @@ void TopLevels::make_references() {
     nodes_.push_back(std::move(root));
 }
 
-/// The few huge pages of a small build's transient memory, which threads share; of a large one's, many may not be
+/// The few huge pages behind the references of a small build, which threads share; of a large one's, many may not be
 /// needed.
-size_t TopLevels::transient_pages() const {
-    const size_t pages = transient_ == nullptr ? 0 : transient_->huge_pages();
+size_t TopLevels::pages_behind() const {
+    const size_t pages = build_memory_ == nullptr ? 0 : build_memory_->huge_pages();
     return pages <= static_cast<size_t>(threads_) ? pages : 0;
 }
 
-size_t TopLevels::page_count() const { return words_in_use_ / kPageWords + 1 + transient_pages(); }
+size_t TopLevels::page_count() const { return words_in_use_ / kPageWords + 1 + pages_behind(); }
 
 /// Every thread takes pages of its own: two that first wrote to one page at the same time would both clear it.
 void TopLevels::take_page(size_t page) {
     const size_t of_references = words_in_use_ / kPageWords + 1;
     if (page >= of_references) {
-        transient_->take_huge_page(page - of_references);
+        build_memory_->take_huge_page(page - of_references);
         return;
     }
     const size_t begin = page * kPageWords;
@@ -221,7 +233,7 @@ void TopLevels::sort_faces() {
         }
         Worker& worker = workers[static_cast<size_t>(number)];
         if (worker.scratch.references().triangle == nullptr) {
-            worker.scratch = ReferenceBuffer(SortedChunk::kScratch, 0, 0);
+            worker.scratch = ReferenceBuffer(SortedChunk::kScratch, 0);
         }
         const auto begin = static_cast<uint32_t>(i) * kChunk;
         const References made = worker.scratch.references();

@@ -19,9 +19,7 @@ struct Segment {
 /// Memory for segments, handed out to any thread.
 class SegmentMemory {
  public:
-    explicit SegmentMemory(size_t capacity, size_t later_bytes = 0, size_t usual_bytes = SIZE_MAX) {
-        buffers_.emplace_back(capacity, later_bytes, usual_bytes);
-    }
+    explicit SegmentMemory(ReferenceBuffer first) { buffers_.push_back(std::move(first)); }
     References take(uint32_t count);
     ReferenceBuffer& first() { return buffers_.front(); }
     /// References of the first buffer that were handed out: all of them if there is another one.
@@ -57,10 +55,13 @@ struct UsedReferences {
 /// Phases 1 and 2: the references and the top of the tree, all threads on one level at a time.
 class TopLevels {
  public:
-    /// transient: what subtrees will take for themselves, whose huge pages are taken as well, if few. Where it is
-    /// given, the memory of the references has room for those of subtrees, and for blocks after them.
+    /// memory: where it is given, at least reference_bytes at its front are for the references, those of subtrees
+    /// behind them, and blocks after both; what subtrees will take for themselves is behind, whose huge pages are taken
+    /// as well, if few.
     TopLevels(const TriangleSoup& soup, const BuildParameters& parameters, const std::atomic<bool>* cancel, int threads,
-              TransientMemory* transient = nullptr);
+              BuildMemory* memory = nullptr);
+
+    static size_t reference_bytes(uint32_t triangles, int threads);
 
     /// Phase 1: boxes of all faces that can be hit. Those of a large scene are sorted as they are made by the leaves of
     /// a multiway split, so that they go through memory once.
@@ -82,7 +83,7 @@ class TopLevels {
         uint32_t node;
         uint32_t segment;
     };
-    size_t transient_pages() const;
+    size_t pages_behind() const;
     /// Of the memory that is usually needed.
     size_t page_count() const;
     void take_page(size_t page);
@@ -110,7 +111,7 @@ class TopLevels {
     const BuildKernels& kernels_;
     const bool is_large_;  ///< whether the root is split several levels at once, if it can be
     const uint32_t segment_size_;
-    TransientMemory* const transient_;
+    BuildMemory* const build_memory_;
     SegmentMemory memory_;
     ReferenceBuffer& first_places_;  ///< of that; others may be added while this one is used
     const size_t words_in_use_;      ///< of those, usually

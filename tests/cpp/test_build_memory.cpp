@@ -1,8 +1,11 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 #include <gtest/gtest.h>
+#include <sys/mman.h>
 
 #include <algorithm>
 #include <atomic>
+#include <numeric>
+#include <optional>
 #include <vector>
 
 #include "kdtree/large_buffer.h"
@@ -13,10 +16,10 @@ namespace espalier {
 namespace {
 
 /// Buffers of one memory, taken by all threads, too many and too large for it: each keeps what was written to it.
-TEST(TransientMemory, GivesEachBufferRoomOfItsOwn) {
+TEST(BuildMemory, GivesEachBufferRoomOfItsOwn) {
     constexpr size_t kBuffers = 200;
     const auto size_of = [](size_t i) { return i % 50 == 7 ? size_t{1} << 20 : 150'000 + 7 * i; };
-    TransientMemory memory(5'000'000);
+    BuildMemory memory({0, 0}, 5'000'000);
     std::vector<LargeBuffer<uint32_t>> buffers(kBuffers);
     std::atomic<size_t> not_zero{0};
     parallel_for(4, kBuffers, [&](size_t i) {
@@ -34,8 +37,8 @@ TEST(TransientMemory, GivesEachBufferRoomOfItsOwn) {
     }
 }
 
-TEST(TransientMemory, TakesNoMoreThanItHas) {
-    TransientMemory memory(0);
+TEST(BuildMemory, TakesNoMoreThanItHas) {
+    BuildMemory memory({0, 0}, 0);
     std::vector<LargeBuffer<std::byte>> buffers;
     for (int i = 0; i < 20; ++i) {
         buffers.push_back(memory.take<std::byte>(size_t{30} << 20));
@@ -47,6 +50,53 @@ TEST(TransientMemory, TakesNoMoreThanItHas) {
     }
 }
 
+bool is_mapped(const void* address) {
+    constexpr uintptr_t kPage = 64 << 10;
+    unsigned char is_resident[kPage / 4096];
+    auto* page = reinterpret_cast<void*>(reinterpret_cast<uintptr_t>(address) / kPage * kPage);
+    return ::mincore(page, 1, is_resident) == 0;
+}
+
+/// What is kept of the front outlives the rest, which is given back in one go.
+TEST(BuildMemory, KeepsPartOfItsFront) {
+    constexpr size_t kFront = 5'000'000;
+    constexpr size_t kKept = 250'000;
+    std::optional<BuildMemory> memory(std::in_place, BuildMemory::Size{kFront, kFront}, size_t{1'000'000});
+    LargeBuffer<uint32_t> front = memory->take_front<uint32_t>();
+    ASSERT_GE(front.bytes(), kFront);
+    LargeBuffer<uint32_t> other = memory->take<uint32_t>(16'700'000);  // nearly all there is behind it
+    std::iota(front.data(), front.data() + front.size(), 0U);
+    other[other.size() - 1] = 7;
+    const uint32_t* first = front.data();
+    const uint32_t* last = first + front.size() - 1;
+
+    const LargeBuffer<uint64_t> kept = memory->keep<uint64_t>(std::move(front), kKept);
+    ASSERT_EQ(static_cast<const void*>(kept.data()), first);
+    EXPECT_EQ(kept.size(), kKept);
+    EXPECT_TRUE(is_mapped(last));
+    const uint32_t* elsewhere = &other[other.size() - 1];
+    EXPECT_EQ(*elsewhere, 7U);
+    other = {};
+    memory.reset();
+    EXPECT_FALSE(is_mapped(last));
+    EXPECT_FALSE(is_mapped(elsewhere));
+    for (size_t i = 0; i < kKept; ++i) {
+        ASSERT_EQ(kept[i], (uint64_t{2 * i + 1} << 32) + 2 * i);
+    }
+}
+
+TEST(BuildMemory, KeepsInFreshMemoryWhatItsFrontIsTooSmallFor) {
+    constexpr size_t kKept = size_t{1} << 20;
+    std::optional<BuildMemory> memory(std::in_place, BuildMemory::Size{1000, 1000}, size_t{0});
+    LargeBuffer<uint32_t> front = memory->take_front<uint32_t>();
+    const uint32_t* first = front.data();
+    LargeBuffer<uint64_t> kept = memory->keep<uint64_t>(std::move(front), kKept);
+    EXPECT_NE(static_cast<const void*>(kept.data()), first);
+    memory.reset();
+    kept[kKept - 1] = 1;
+    EXPECT_EQ(kept[0], 0U);
+}
+
 /// Many inner nodes of two leaves each, one of them in part of a block and one in several.
 TEST(SubtreeOutput, KeepsWhatItHoldsAsItGrows) {
     constexpr uint32_t kInner = 3000;
@@ -54,7 +104,7 @@ TEST(SubtreeOutput, KeepsWhatItHoldsAsItGrows) {
         const auto at = static_cast<float>(i);
         return Box3f{{at, at, at}, {at + 1, at + 1, at + 1}};
     };
-    TransientMemory memory(0);
+    BuildMemory memory({0, 0}, 0);
     SubtreeOutput output(100, &memory);
     for (uint32_t i = 0; i < kInner; ++i) {
         const size_t inner = output.open_inner();
