@@ -9,6 +9,7 @@
 #include <cstdint>
 #include <memory>
 #include <new>
+#include <optional>
 #include <span>
 #include <type_traits>
 #include <utility>
@@ -168,6 +169,7 @@ class BuildMemory {
         : memory_(front.most + LargeBuffer<std::byte>::kHugePage + std::max(kLeastBytes, 2 * usual_behind),
                   front.usual),
           front_(memory_.take_front(front.most)),
+          used_end_(front_.data() + std::min(front.usual, front_.bytes())),
           huge_pages_(LargeBuffer<std::byte>::huge_pages(usual_behind)) {
         memory_.expect_use(usual_behind);
     }
@@ -182,6 +184,25 @@ class BuildMemory {
     template <class T, class U>
     LargeBuffer<T> keep(LargeBuffer<U> front, size_t capacity) {
         return std::move(front).template reuse_for<T>(capacity, memory_);
+    }
+
+    /// Next to what was kept of the front, if there is so much of it left whose pages have been taken.
+    template <class T>
+    std::optional<LargeBuffer<T>> keep_more(size_t capacity) {
+        auto* begin = static_cast<std::byte*>(memory_.mapping_);
+        constexpr size_t kPage = LargeBuffer<T>::kPage;
+        const size_t bytes = (capacity * sizeof(T) + kPage - 1) / kPage * kPage;
+        if (begin >= used_end_ || bytes > static_cast<size_t>(used_end_ - begin)) {
+            return std::nullopt;
+        }
+        LargeBuffer<T> kept;
+        kept.data_ = reinterpret_cast<T*>(begin);
+        kept.capacity_ = capacity;
+        kept.mapping_ = begin;
+        kept.mapped_ = bytes;
+        memory_.mapping_ = begin + bytes;
+        memory_.mapped_ -= bytes;
+        return kept;
     }
 
     /// What it returns must be destroyed before this. Any thread may call it.
@@ -209,7 +230,8 @@ class BuildMemory {
     static constexpr size_t kLeastBytes = size_t{64} << 20;  ///< of addresses, not of memory
     LargeBuffer<std::byte> memory_;
     LargeBuffer<std::byte> front_;
-    size_t huge_pages_;  ///< behind the front
+    const std::byte* used_end_;  ///< of the front, usually
+    size_t huge_pages_;          ///< behind the front
     std::atomic<size_t> used_{0};
 };
 

@@ -66,10 +66,14 @@ void build_layout(const TriangleSoup& soup, std::span<const TreePiece> pieces, i
     parallel_for(threads, runs.size(), [&](size_t i) { collapse.plan(runs[i]); });
     // What one thread alone can do, while the others write blocks.
     std::vector<WideSubtree> subtrees;
+    bool has_pages = false;  // the wide nodes' memory
     parallel_for(threads, 1 + block_tasks.size(), [&](size_t i) {
         if (i == 0) {
             collapse.plan_above(runs);
-            tree.wide_nodes = LargeBuffer<WideNode>(collapse.wide_nodes(0));
+            const uint32_t count = collapse.wide_nodes(0);
+            auto beside_blocks = memory.keep_more<WideNode>(count);
+            has_pages = beside_blocks.has_value();
+            tree.wide_nodes = has_pages ? std::move(*beside_blocks) : LargeBuffer<WideNode>(count);
             subtrees = collapse.write_above(runs, tree.wide_nodes.data());
             return;
         }
@@ -79,7 +83,9 @@ void build_layout(const TriangleSoup& soup, std::span<const TreePiece> pieces, i
     });
     parallel_for(threads, subtrees.size(), [&](size_t i) {
         const WideSubtree& subtree = subtrees[i];
-        tree.wide_nodes.take_pages(subtree.place, subtree.place + collapse.wide_nodes(subtree.node));
+        if (!has_pages) {
+            tree.wide_nodes.take_pages(subtree.place, subtree.place + collapse.wide_nodes(subtree.node));
+        }
         collapse.write(subtree, 0, tree.wide_nodes.data());
     });
 }

@@ -57,7 +57,7 @@ bool is_mapped(const void* address) {
     return ::mincore(page, 1, is_resident) == 0;
 }
 
-/// What is kept of the front outlives the rest, which is given back in one go.
+/// What is kept of the front, and next to that, outlives the rest, which is given back in one go.
 TEST(BuildMemory, KeepsPartOfItsFront) {
     constexpr size_t kFront = 5'000'000;
     constexpr size_t kKept = 250'000;
@@ -73,6 +73,12 @@ TEST(BuildMemory, KeepsPartOfItsFront) {
     const LargeBuffer<uint64_t> kept = memory->keep<uint64_t>(std::move(front), kKept);
     ASSERT_EQ(static_cast<const void*>(kept.data()), first);
     EXPECT_EQ(kept.size(), kKept);
+    EXPECT_FALSE(memory->keep_more<uint64_t>(kKept + kKept / 2 + 1).has_value());
+    std::optional<LargeBuffer<uint64_t>> more = memory->keep_more<uint64_t>(kKept);
+    ASSERT_TRUE(more.has_value());
+    EXPECT_GE(more->data(), kept.data() + kKept);
+    EXPECT_LE(static_cast<const void*>(more->data() + kKept), first + kFront / sizeof(uint32_t));
+    std::fill_n(more->data(), kKept, 9U);
     EXPECT_TRUE(is_mapped(last));
     const uint32_t* elsewhere = &other[other.size() - 1];
     EXPECT_EQ(*elsewhere, 7U);
@@ -82,6 +88,7 @@ TEST(BuildMemory, KeepsPartOfItsFront) {
     EXPECT_FALSE(is_mapped(elsewhere));
     for (size_t i = 0; i < kKept; ++i) {
         ASSERT_EQ(kept[i], (uint64_t{2 * i + 1} << 32) + 2 * i);
+        ASSERT_EQ((*more)[i], 9U);
     }
 }
 
@@ -92,6 +99,7 @@ TEST(BuildMemory, KeepsInFreshMemoryWhatItsFrontIsTooSmallFor) {
     const uint32_t* first = front.data();
     LargeBuffer<uint64_t> kept = memory->keep<uint64_t>(std::move(front), kKept);
     EXPECT_NE(static_cast<const void*>(kept.data()), first);
+    EXPECT_FALSE(memory->keep_more<uint64_t>(1).has_value());
     memory.reset();
     kept[kKept - 1] = 1;
     EXPECT_EQ(kept[0], 0U);
