@@ -9,7 +9,6 @@
 #include <cstdint>
 #include <memory>
 #include <new>
-#include <optional>
 #include <span>
 #include <type_traits>
 #include <utility>
@@ -169,7 +168,8 @@ class BuildMemory {
         : memory_(front.most + LargeBuffer<std::byte>::kHugePage + std::max(kLeastBytes, 2 * usual_behind),
                   front.usual),
           front_(memory_.take_front(front.most)),
-          used_end_(front_.data() + std::min(front.usual, front_.bytes())),
+          begin_(front_.data()),
+          used_end_(begin_ + std::min(front.usual, front_.bytes())),
           huge_pages_(LargeBuffer<std::byte>::huge_pages(usual_behind)) {
         memory_.expect_use(usual_behind);
     }
@@ -186,14 +186,15 @@ class BuildMemory {
         return std::move(front).template reuse_for<T>(capacity, memory_);
     }
 
-    /// Next to what was kept of the front, if there is so much of it left whose pages have been taken.
+    /// Next to what was kept of the front, if so many items fit between that and what is usually used, else in fresh
+    /// memory.
     template <class T>
-    std::optional<LargeBuffer<T>> keep_more(size_t capacity) {
+    LargeBuffer<T> keep_more(size_t capacity) {
         auto* begin = static_cast<std::byte*>(memory_.mapping_);
         constexpr size_t kPage = LargeBuffer<T>::kPage;
         const size_t bytes = (capacity * sizeof(T) + kPage - 1) / kPage * kPage;
         if (begin >= used_end_ || bytes > static_cast<size_t>(used_end_ - begin)) {
-            return std::nullopt;
+            return LargeBuffer<T>(capacity);
         }
         LargeBuffer<T> kept;
         kept.data_ = reinterpret_cast<T*>(begin);
@@ -203,6 +204,12 @@ class BuildMemory {
         memory_.mapping_ = begin + bytes;
         memory_.mapped_ -= bytes;
         return kept;
+    }
+    /// Whether that lies where pages were usually taken when the front was in use.
+    template <class T>
+    bool has_pages(const LargeBuffer<T>& kept) const {
+        const auto* begin = reinterpret_cast<const std::byte*>(kept.data());
+        return begin >= begin_ && begin + kept.bytes() <= used_end_;
     }
 
     /// What it returns must be destroyed before this. Any thread may call it.
@@ -230,7 +237,8 @@ class BuildMemory {
     static constexpr size_t kLeastBytes = size_t{64} << 20;  ///< of addresses, not of memory
     LargeBuffer<std::byte> memory_;
     LargeBuffer<std::byte> front_;
-    const std::byte* used_end_;  ///< of the front, usually
+    const std::byte* begin_;     ///< of the front
+    const std::byte* used_end_;  ///< of what is usually used of it
     size_t huge_pages_;          ///< behind the front
     std::atomic<size_t> used_{0};
 };

@@ -66,24 +66,24 @@ void build_layout(const TriangleSoup& soup, std::span<const TreePiece> pieces, i
     parallel_for(threads, runs.size(), [&](size_t i) { collapse.plan(runs[i]); });
     // What one thread alone can do, while the others write blocks.
     std::vector<WideSubtree> subtrees;
-    bool has_pages = false;  // the wide nodes' memory
+    const bool blocks_have_pages = memory.has_pages(tree.blocks);
     parallel_for(threads, 1 + block_tasks.size(), [&](size_t i) {
         if (i == 0) {
             collapse.plan_above(runs);
-            const uint32_t count = collapse.wide_nodes(0);
-            auto beside_blocks = memory.keep_more<WideNode>(count);
-            has_pages = beside_blocks.has_value();
-            tree.wide_nodes = has_pages ? std::move(*beside_blocks) : LargeBuffer<WideNode>(count);
+            tree.wide_nodes = memory.keep_more<WideNode>(collapse.wide_nodes(0));
             subtrees = collapse.write_above(runs, tree.wide_nodes.data());
             return;
         }
         const BlockTask& task = block_tasks[i - 1];
-        tree.blocks.take_pages(task.place, task.place + task.count);
+        if (!blocks_have_pages) {
+            tree.blocks.take_pages(task.place, task.place + task.count);
+        }
         build_kernels().write_blocks(soup, classes, task.triangles, task.count, tree.blocks.data() + task.place);
     });
+    const bool nodes_have_pages = memory.has_pages(tree.wide_nodes);
     parallel_for(threads, subtrees.size(), [&](size_t i) {
         const WideSubtree& subtree = subtrees[i];
-        if (!has_pages) {
+        if (!nodes_have_pages) {
             tree.wide_nodes.take_pages(subtree.place, subtree.place + collapse.wide_nodes(subtree.node));
         }
         collapse.write(subtree, 0, tree.wide_nodes.data());
