@@ -53,8 +53,8 @@ TEST(BuildMemory, TakesNoMoreThanItHas) {
 bool is_mapped(const void* address) {
     constexpr uintptr_t kPage = 64 << 10;
     unsigned char is_resident[kPage / 4096];
-    auto* page = reinterpret_cast<void*>(reinterpret_cast<uintptr_t>(address) / kPage * kPage);
-    return ::mincore(page, 1, is_resident) == 0;
+    auto* byte = static_cast<std::byte*>(const_cast<void*>(address));
+    return ::mincore(byte - reinterpret_cast<uintptr_t>(byte) % kPage, 1, is_resident) == 0;
 }
 
 /// What is kept of the front, and next to that, outlives the rest, which is given back in one go.
@@ -78,7 +78,8 @@ TEST(BuildMemory, KeepsPartOfItsFront) {
     LargeBuffer<uint64_t> more = memory->keep_more<uint64_t>(kKept);
     EXPECT_TRUE(memory->has_pages(more));
     EXPECT_GE(more.data(), kept.data() + kKept);
-    EXPECT_LE(static_cast<const void*>(more.data() + kKept), first + kFront / sizeof(uint32_t));
+    EXPECT_LE(reinterpret_cast<const std::byte*>(more.data() + kKept),
+              reinterpret_cast<const std::byte*>(first) + kFront);
     std::fill_n(more.data(), kKept, 9U);
     EXPECT_TRUE(is_mapped(last));
     const uint32_t* elsewhere = &other[other.size() - 1];
