@@ -30,7 +30,8 @@ void take_pages(T* begin, T* end) {
 }
 
 /// Room for `capacity` items straight from the operating system. Memory is taken only when it is first written, in huge
-/// pages where they pay: a fault costs several times what clearing its 4 KiB does. Items start as zero bytes.
+/// pages where they pay: a fault costs several times what clearing its 4 KiB does. Items in fresh memory start as
+/// zero bytes.
 template <class T>
 class LargeBuffer {
     static_assert(std::is_trivially_copyable_v<T>);
@@ -79,21 +80,6 @@ class LargeBuffer {
     /// How many of them so many bytes are worth: a tail too short for one of its own is left to small ones.
     static size_t huge_pages(size_t bytes) { return (bytes + kHugePage - kHugePagesFrom) / kHugePage; }
 
-    /// Parts with so many items at the front, and what is left until the next huge page.
-    LargeBuffer take_front(size_t capacity) {
-        const auto end = reinterpret_cast<uintptr_t>(data_ + capacity);
-        const size_t taken = std::min(capacity + (0 - end) % kHugePage / sizeof(T), capacity_);
-        LargeBuffer front;
-        front.data_ = std::exchange(data_, data_ + taken);
-        front.capacity_ = taken;
-        capacity_ -= taken;
-        front.mapping_ = std::exchange(mapping_, data_);
-        front.mapped_ =
-            static_cast<size_t>(static_cast<std::byte*>(mapping_) - static_cast<std::byte*>(front.mapping_));
-        mapped_ -= front.mapped_;
-        return front;
-    }
-
     /// The same memory for other items, whatever it holds, or fresh memory if they need more. What they do not need is
     /// given back: with what it was taken from the front of, if that is all still there.
     template <class U>
@@ -119,13 +105,6 @@ class LargeBuffer {
         return reused;
     }
 
-    /// Asks for huge pages for so many bytes.
-    void expect_use(size_t expected_bytes) {
-        if (const size_t huge = kHugePage * huge_pages(std::min(bytes(), expected_bytes)); huge != 0) {
-            ::madvise(data_, huge, MADV_HUGEPAGE);
-        }
-    }
-
     /// Takes the pages of items [begin, end) now (see above).
     void take_pages(size_t begin, size_t end) { espalier::take_pages(data_ + begin, data_ + std::min(end, capacity_)); }
     void take_huge_page(size_t page) {
@@ -148,6 +127,29 @@ class LargeBuffer {
     static constexpr size_t kPage = size_t{64} << 10;  ///< the largest small page of any system
     /// From here on clearing the rest of a huge page costs no more than small pages do, and little memory is wasted.
     static constexpr size_t kHugePagesFrom = size_t{768} << 10;
+
+    /// Parts with so many items at the front, and what is left until the next huge page, which must begin in it.
+    LargeBuffer take_front(size_t capacity) {
+        const auto end = reinterpret_cast<uintptr_t>(data_ + capacity);
+        const size_t taken = std::min(capacity + (0 - end) % kHugePage / sizeof(T), capacity_);
+        LargeBuffer front;
+        front.data_ = std::exchange(data_, data_ + taken);
+        front.capacity_ = taken;
+        capacity_ -= taken;
+        front.mapping_ = std::exchange(mapping_, data_);
+        front.mapped_ =
+            static_cast<size_t>(static_cast<std::byte*>(mapping_) - static_cast<std::byte*>(front.mapping_));
+        mapped_ -= front.mapped_;
+        return front;
+    }
+
+    /// Asks for huge pages for so many bytes of memory that begins with one.
+    void expect_use(size_t expected_bytes) {
+        if (const size_t huge = kHugePage * huge_pages(std::min(bytes(), expected_bytes)); huge != 0) {
+            ::madvise(data_, huge, MADV_HUGEPAGE);
+        }
+    }
+
     T* data_ = nullptr;
     size_t capacity_ = 0;
     void* mapping_ = nullptr;  ///< null also where the memory is another's
@@ -180,10 +182,15 @@ class BuildMemory {
         const size_t capacity = front_.bytes() / sizeof(T);
         return keep<T>(std::move(front_), capacity);
     }
-    /// Of the front, so many items for what the tree keeps, or as many in fresh memory where it is too small.
+    /// Of the front, whatever it holds, so many items for what the tree keeps; or as many in fresh memory where it is
+    /// too small, and then nothing of it.
     template <class T, class U>
     LargeBuffer<T> keep(LargeBuffer<U> front, size_t capacity) {
-        return std::move(front).template reuse_for<T>(capacity, memory_);
+        LargeBuffer<T> kept = std::move(front).template reuse_for<T>(capacity, memory_);
+        if (reinterpret_cast<const std::byte*>(kept.data()) != begin_) {
+            used_end_ = begin_;
+        }
+        return kept;
     }
 
     /// Next to what was kept of the front, if so many items fit between that and what is usually used, else in fresh
@@ -205,14 +212,14 @@ class BuildMemory {
         memory_.mapped_ -= bytes;
         return kept;
     }
-    /// Whether that lies where pages were usually taken when the front was in use.
+    /// Whether these items lie where pages were usually taken when the front was in use.
     template <class T>
     bool has_pages(const LargeBuffer<T>& kept) const {
         const auto* begin = reinterpret_cast<const std::byte*>(kept.data());
         return begin >= begin_ && begin + kept.bytes() <= used_end_;
     }
 
-    /// What it returns must be destroyed before this. Any thread may call it.
+    /// What it returns must be destroyed before this. Any thread may call it, unlike those above.
     template <class T>
     LargeBuffer<T> take(size_t capacity) {
         constexpr size_t kLine = 64;

@@ -75,7 +75,7 @@ class ReferenceBuffer {
     }
 
  private:
-    /// Not a multiple of a page, so that the arrays do not compete for the same cache sets.
+    /// Hardly ever a multiple of a page, so that the arrays do not compete for the same cache sets.
     static size_t stride_for(size_t capacity) { return (capacity + kSlack + 15) / 16 * 16 + 16; }
 
     size_t stride_ = 0;

@@ -16,7 +16,7 @@ namespace espalier {
 /// builds what decides where its nodes lie until phase 4, and the rest until phase 5, never what the tree is.
 class Subtrees : public SubtreeSharing {
  public:
-    /// memory: for what this needs itself; the references have their own.
+    /// memory: for what this needs itself; the references lie at its front, where the tree's blocks then stay.
     Subtrees(const TriangleSoup& soup, const BuildParameters& parameters, const std::atomic<bool>* cancel, int threads,
              BuildMemory& memory)
         : memory_(memory),

@@ -91,7 +91,7 @@ void TopLevels::make_references() {
     std::vector<RejectedFaces> rejected(count);
     TopNode root{};
     root.segments.resize(count);
-    // Pages come first, but nobody waits for the last of them, where references do not lie.
+    // Pages come first, but nobody waits for the last of them, where no references lie but in the smallest scenes.
     const size_t pages = is_large_ ? 0 : page_count();
     parallel_for(threads_, pages + count, [&](size_t task) {
         if (task < pages) {

@@ -55,9 +55,8 @@ struct UsedReferences {
 /// Phases 1 and 2: the references and the top of the tree, all threads on one level at a time.
 class TopLevels {
  public:
-    /// memory: where it is given, at least reference_bytes at its front are for the references, those of subtrees
-    /// behind them, and blocks after both; what subtrees will take for themselves is behind, whose huge pages are taken
-    /// as well, if few.
+    /// memory: if any, its front, of at least reference_bytes, holds the references and those of subtrees, and later
+    /// the blocks; behind it lies what subtrees take for themselves, whose huge pages are taken too, if few.
     TopLevels(const TriangleSoup& soup, const BuildParameters& parameters, const std::atomic<bool>* cancel, int threads,
               BuildMemory* memory = nullptr);
 

@@ -70,13 +70,14 @@ TEST(BuildMemory, KeepsPartOfItsFront) {
     const uint32_t* first = front.data();
     const uint32_t* last = first + front.size() - 1;
 
-    const LargeBuffer<uint64_t> kept = memory->keep<uint64_t>(std::move(front), kKept);
+    LargeBuffer<uint64_t> kept = memory->keep<uint64_t>(std::move(front), kKept);
     ASSERT_EQ(static_cast<const void*>(kept.data()), first);
     EXPECT_EQ(kept.size(), kKept);
     EXPECT_TRUE(memory->has_pages(kept));
     EXPECT_FALSE(memory->has_pages(memory->keep_more<uint64_t>(kKept + kKept / 2 + 1)));
     LargeBuffer<uint64_t> more = memory->keep_more<uint64_t>(kKept);
     EXPECT_TRUE(memory->has_pages(more));
+    EXPECT_EQ(reinterpret_cast<uintptr_t>(more.data()) % 64, 0U);
     EXPECT_GE(more.data(), kept.data() + kKept);
     EXPECT_LE(reinterpret_cast<const std::byte*>(more.data() + kKept),
               reinterpret_cast<const std::byte*>(first) + kFront);
@@ -92,6 +93,20 @@ TEST(BuildMemory, KeepsPartOfItsFront) {
         ASSERT_EQ(kept[i], (uint64_t{2 * i + 1} << 32) + 2 * i);
         ASSERT_EQ(more[i], 9U);
     }
+    const uint64_t* last_of_both[] = {&kept[kKept - 1], &more[kKept - 1]};
+    kept = {};
+    more = {};
+    EXPECT_FALSE(is_mapped(last_of_both[0]));
+    EXPECT_FALSE(is_mapped(last_of_both[1]));
+}
+
+/// More than is usually used of the front leaves nothing to put beside it.
+TEST(BuildMemory, KeepsMoreThanUsualWithoutPages) {
+    constexpr size_t kUsual = 1'000'000;
+    BuildMemory memory({4 * kUsual, kUsual}, 0);
+    const LargeBuffer<std::byte> kept = memory.keep<std::byte>(memory.take_front<uint32_t>(), 2 * kUsual);
+    EXPECT_FALSE(memory.has_pages(kept));
+    EXPECT_FALSE(memory.has_pages(memory.keep_more<std::byte>(1)));
 }
 
 TEST(BuildMemory, KeepsInFreshMemoryWhatItsFrontIsTooSmallFor) {
