@@ -48,7 +48,8 @@ class LargeBuffer {
         if (capacity > SIZE_MAX / 2 / sizeof(T)) {
             throw std::bad_alloc();
         }
-        const size_t huge = kHugePage * huge_pages(std::min(bytes(), expected_bytes));
+        const size_t pages = huge_pages(std::min(bytes(), expected_bytes));
+        const size_t huge = kHugePage * pages;
         mapped_ = std::max(bytes(), huge) + (huge != 0 ? kHugePage : 0);
         void* memory =
             ::mmap(nullptr, mapped_, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);
@@ -61,7 +62,7 @@ class LargeBuffer {
             std::align(kHugePage, huge, memory, space);
         }
         data_ = static_cast<T*>(memory);
-        expect_use(expected_bytes);
+        ask_for_huge_pages(pages);
     }
     LargeBuffer(LargeBuffer&& other) noexcept { *this = std::move(other); }
     LargeBuffer& operator=(LargeBuffer&& other) noexcept {
@@ -80,31 +81,6 @@ class LargeBuffer {
     /// How many of them so many bytes are worth: a tail too short for one of its own is left to small ones.
     static size_t huge_pages(size_t bytes) { return (bytes + kHugePage - kHugePagesFrom) / kHugePage; }
 
-    /// The same memory for other items, whatever it holds, or fresh memory if they need more. What they do not need is
-    /// given back: with what it was taken from the front of, if that is all still there.
-    template <class U>
-    LargeBuffer<U> reuse_for(size_t capacity, LargeBuffer<std::byte>& behind) && {
-        if (capacity == 0 || capacity * sizeof(U) > bytes()) {
-            return LargeBuffer<U>(capacity);
-        }
-        LargeBuffer<U> reused;
-        reused.data_ = reinterpret_cast<U*>(std::exchange(data_, nullptr));
-        reused.capacity_ = capacity;
-        auto* mapping = static_cast<std::byte*>(std::exchange(mapping_, nullptr));
-        const auto needed = static_cast<size_t>(reinterpret_cast<std::byte*>(reused.data_ + capacity) - mapping);
-        const size_t kept = std::min((needed + kPage - 1) / kPage * kPage, mapped_);
-        reused.mapping_ = mapping;
-        reused.mapped_ = kept;
-        if (mapping + mapped_ == behind.mapping_) {
-            behind.mapping_ = mapping + kept;
-            behind.mapped_ += mapped_ - kept;
-        } else if (kept < mapped_) {
-            ::munmap(mapping + kept, mapped_ - kept);
-        }
-        capacity_ = mapped_ = 0;
-        return reused;
-    }
-
     /// Takes the pages of items [begin, end) now (see above).
     void take_pages(size_t begin, size_t end) { espalier::take_pages(data_ + begin, data_ + std::min(end, capacity_)); }
     void take_huge_page(size_t page) {
@@ -121,32 +97,14 @@ class LargeBuffer {
     std::span<const T> span() const { return {data_, capacity_}; }
 
  private:
-    template <class U>
-    friend class LargeBuffer;
     friend class BuildMemory;
-    static constexpr size_t kPage = size_t{64} << 10;  ///< the largest small page of any system
     /// From here on clearing the rest of a huge page costs no more than small pages do, and little memory is wasted.
     static constexpr size_t kHugePagesFrom = size_t{768} << 10;
 
-    /// Parts with so many items at the front, and what is left until the next huge page, which must begin in it.
-    LargeBuffer take_front(size_t capacity) {
-        const auto end = reinterpret_cast<uintptr_t>(data_ + capacity);
-        const size_t taken = std::min(capacity + (0 - end) % kHugePage / sizeof(T), capacity_);
-        LargeBuffer front;
-        front.data_ = std::exchange(data_, data_ + taken);
-        front.capacity_ = taken;
-        capacity_ -= taken;
-        front.mapping_ = std::exchange(mapping_, data_);
-        front.mapped_ =
-            static_cast<size_t>(static_cast<std::byte*>(mapping_) - static_cast<std::byte*>(front.mapping_));
-        mapped_ -= front.mapped_;
-        return front;
-    }
-
-    /// Asks for huge pages for so many bytes of memory that begins with one.
-    void expect_use(size_t expected_bytes) {
-        if (const size_t huge = kHugePage * huge_pages(std::min(bytes(), expected_bytes)); huge != 0) {
-            ::madvise(data_, huge, MADV_HUGEPAGE);
+    /// So many, from where its items begin, which must be where such a page does.
+    void ask_for_huge_pages(size_t pages) {
+        if (pages != 0) {
+            ::madvise(data_, pages * kHugePage, MADV_HUGEPAGE);
         }
     }
 
@@ -167,30 +125,33 @@ class BuildMemory {
         size_t usual;
     };
     BuildMemory(Size front, size_t usual_behind)
-        : memory_(front.most + LargeBuffer<std::byte>::kHugePage + std::max(kLeastBytes, 2 * usual_behind),
-                  front.usual),
-          front_(memory_.take_front(front.most)),
-          begin_(front_.data()),
-          used_end_(begin_ + std::min(front.usual, front_.bytes())),
+        : memory_(front.most + kHugePage + std::max(kLeastBytes, 2 * usual_behind), front.usual),
+          begin_(memory_.data_),
           huge_pages_(LargeBuffer<std::byte>::huge_pages(usual_behind)) {
-        memory_.expect_use(usual_behind);
+        // The front ends where a huge page begins.
+        const size_t most = front.most + (0 - reinterpret_cast<uintptr_t>(begin_ + front.most)) % kHugePage;
+        used_end_ = begin_ + std::min(front.usual, most);
+        memory_.data_ += most;
+        memory_.capacity_ -= most;
+        memory_.ask_for_huge_pages(huge_pages_);
     }
 
     /// The front, which may outlive this.
     template <class T>
     LargeBuffer<T> take_front() {
-        const size_t capacity = front_.bytes() / sizeof(T);
-        return keep<T>(std::move(front_), capacity);
+        return part_with<T>(begin_, static_cast<size_t>(memory_.data_ - begin_) / sizeof(T));
     }
-    /// Of the front, whatever it holds, so many items for what the tree keeps; or as many in fresh memory where it is
-    /// too small, and then nothing of it.
+    /// Of the front that was taken, whatever it holds, so many items for what the tree keeps; or as many in fresh
+    /// memory where it is too small, and then nothing of it.
     template <class T, class U>
     LargeBuffer<T> keep(LargeBuffer<U> front, size_t capacity) {
-        LargeBuffer<T> kept = std::move(front).template reuse_for<T>(capacity, memory_);
-        if (reinterpret_cast<const std::byte*>(kept.data()) != begin_) {
+        if (capacity == 0 || capacity * sizeof(T) > front.bytes()) {
             used_end_ = begin_;
+            return LargeBuffer<T>(capacity);
         }
-        return kept;
+        memory_.mapping_ = std::exchange(front.mapping_, nullptr);
+        memory_.mapped_ += front.mapped_;
+        return part_with<T>(begin_, capacity);
     }
 
     /// Next to what was kept of the front, if so many items fit between that and what is usually used, else in fresh
@@ -198,19 +159,10 @@ class BuildMemory {
     template <class T>
     LargeBuffer<T> keep_more(size_t capacity) {
         auto* begin = static_cast<std::byte*>(memory_.mapping_);
-        constexpr size_t kPage = LargeBuffer<T>::kPage;
-        const size_t bytes = (capacity * sizeof(T) + kPage - 1) / kPage * kPage;
-        if (begin >= used_end_ || bytes > static_cast<size_t>(used_end_ - begin)) {
+        if (begin + whole_pages(capacity * sizeof(T)) > used_end_) {
             return LargeBuffer<T>(capacity);
         }
-        LargeBuffer<T> kept;
-        kept.data_ = reinterpret_cast<T*>(begin);
-        kept.capacity_ = capacity;
-        kept.mapping_ = begin;
-        kept.mapped_ = bytes;
-        memory_.mapping_ = begin + bytes;
-        memory_.mapped_ -= bytes;
-        return kept;
+        return part_with<T>(begin, capacity);
     }
     /// Whether these items lie where pages were usually taken when the front was in use.
     template <class T>
@@ -241,12 +193,33 @@ class BuildMemory {
     void take_huge_page(size_t page) { memory_.take_huge_page(page); }
 
  private:
+    static constexpr size_t kHugePage = LargeBuffer<std::byte>::kHugePage;
     static constexpr size_t kLeastBytes = size_t{64} << 20;  ///< of addresses, not of memory
-    LargeBuffer<std::byte> memory_;
-    LargeBuffer<std::byte> front_;
-    const std::byte* begin_;     ///< of the front
-    const std::byte* used_end_;  ///< of what is usually used of it
-    size_t huge_pages_;          ///< behind the front
+
+    static size_t whole_pages(size_t bytes) {
+        constexpr size_t kPage = size_t{64} << 10;  // the largest small page of any system
+        return (bytes + kPage - 1) / kPage * kPage;
+    }
+
+    /// Items that lie at `data`, in or at the beginning of the mapping, which from then on begins behind them.
+    template <class T>
+    LargeBuffer<T> part_with(std::byte* data, size_t capacity) {
+        auto* mapping = static_cast<std::byte*>(memory_.mapping_);
+        const auto needed = static_cast<size_t>(data + capacity * sizeof(T) - mapping);
+        LargeBuffer<T> kept;
+        kept.data_ = reinterpret_cast<T*>(data);
+        kept.capacity_ = capacity;
+        kept.mapping_ = mapping;
+        kept.mapped_ = std::min(whole_pages(needed), static_cast<size_t>(memory_.data_ - mapping));
+        memory_.mapping_ = mapping + kept.mapped_;
+        memory_.mapped_ -= kept.mapped_;
+        return kept;
+    }
+
+    LargeBuffer<std::byte> memory_;  ///< its items lie behind the front, its mapping begins with what is not kept of it
+    std::byte* const begin_;         ///< of the front
+    const std::byte* used_end_;      ///< of what is usually used of it
+    const size_t huge_pages_;        ///< behind the front
     std::atomic<size_t> used_{0};
 };
 

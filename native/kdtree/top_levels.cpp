@@ -125,13 +125,12 @@ size_t TopLevels::pages_behind() const {
     return pages <= static_cast<size_t>(threads_) ? pages : 0;
 }
 
-size_t TopLevels::page_count() const { return words_in_use_ / kPageWords + 1 + pages_behind(); }
+size_t TopLevels::pages_of_references() const { return words_in_use_ / kPageWords + 1; }
 
 /// Every thread takes pages of its own: two that first wrote to one page at the same time would both clear it.
 void TopLevels::take_page(size_t page) {
-    const size_t of_references = words_in_use_ / kPageWords + 1;
-    if (page >= of_references) {
-        build_memory_->take_huge_page(page - of_references);
+    if (page >= pages_of_references()) {
+        build_memory_->take_huge_page(page - pages_of_references());
         return;
     }
     const size_t begin = page * kPageWords;

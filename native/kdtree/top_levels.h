@@ -60,6 +60,7 @@ class TopLevels {
     TopLevels(const TriangleSoup& soup, const BuildParameters& parameters, const std::atomic<bool>* cancel, int threads,
               BuildMemory* memory = nullptr);
 
+    /// What references take at the front of a memory.
     static size_t reference_bytes(uint32_t triangles, int threads);
 
     /// Phase 1: boxes of all faces that can be hit. Those of a large scene are sorted as they are made by the leaves of
@@ -83,8 +84,9 @@ class TopLevels {
         uint32_t segment;
     };
     size_t pages_behind() const;
+    size_t pages_of_references() const;
     /// Of the memory that is usually needed.
-    size_t page_count() const;
+    size_t page_count() const { return pages_of_references() + pages_behind(); }
     void take_page(size_t page);
     bool sort_root();
     Box3f bound_vertices() const;
